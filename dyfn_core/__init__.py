@@ -1,0 +1,1 @@
+"""Streaming monocular geometry that keeps its scale (no ROS in here)."""

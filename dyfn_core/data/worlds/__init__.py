@@ -1,0 +1,1 @@
+"""Rendered training worlds with exact depth, intrinsics and poses."""

@@ -1,0 +1,1 @@
+"""Image -> latent -> (DyFN) -> latent -> points."""

@@ -1,0 +1,1 @@
+"""The trainer of the base model and of the stabilizer."""

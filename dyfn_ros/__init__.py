@@ -1,0 +1,1 @@
+"""ROS 2 node and recording tools around dyfn_core."""
