@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
+import numpy as np
+import torch
 from torch import Tensor, nn
 
-from dyfn_core.prediction import StreamState
+from dyfn_core.geometry.camera import (
+    depth_to_points,
+    focal_from_fov,
+    intrinsics_from_focal,
+    recover_focal_shift,
+)
+from dyfn_core.models.stabilizer import Stabilizer
+from dyfn_core.prediction import Prediction, StreamState
 
 
 @dataclass(frozen=True)
@@ -39,11 +50,20 @@ class AffinePoints:
 class GeometryModel(nn.Module, ABC):
     """An encoder and a decoder around one latent, with DyFN in between.
 
-    stabilizer: the DyFN module, or None for a plain base model.
+    config: everything that builds the model again, JSON-able, with its registered "type"; the
+        stabilizer's part is under "stabilizer" (StabilizerConfig.to_dict(), or None).
+    stabilizer: the DyFN module, or None for a plain base model. Its parameters are
+        "stabilizer.*" in the state dict of every model.
     """
 
+    config: dict[str, Any]
     mask_threshold: float = 0.5
-    stabilizer: nn.Module | None = None
+    stabilizer: Stabilizer | None = None
+
+    @classmethod
+    @abstractmethod
+    def from_config(cls, config: dict[str, Any]) -> GeometryModel:
+        """The model that `config` describes, untrained. ValueError for unknown or bad keys."""
 
     @abstractmethod
     def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
@@ -60,3 +80,172 @@ class GeometryModel(nn.Module, ABC):
         if self.stabilizer is None:
             return features, None
         return self.stabilizer(features, state)
+
+    def stabilize_latent(
+        self, latent: Latent, state: StreamState | None
+    ) -> tuple[Latent, StreamState | None]:
+        """One streaming step on a latent; what inference does between encode and decode."""
+        features, state = self.stabilize(latent.features, state)
+        return replace(latent, features=features), state
+
+    def set_stabilizer(self, stabilizer: Stabilizer | None) -> None:
+        """Put a DyFN in (or take it out), keeping `config` in step."""
+        self.stabilizer = stabilizer
+        described = None if stabilizer is None else stabilizer.config.to_dict()
+        self.config = {**self.config, "stabilizer": described}
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    def predict_affine(
+        self,
+        image: Tensor,
+        state: StreamState | None = None,
+        num_tokens: int | None = None,
+        stabilize: bool = True,
+    ) -> tuple[AffinePoints, StreamState | None]:
+        """image B x 3 x H x W float RGB in 0..1 -> affine-invariant points, next state.
+
+        With stabilize=False nothing of the stabilizer runs and the state comes back as None.
+        """
+        latent = self.encode(image, num_tokens)
+        if stabilize and self.stabilizer is not None:
+            latent, state = self.stabilize_latent(latent, state)
+        else:
+            state = None
+        return self.decode(latent), state
+
+    @torch.inference_mode()
+    def infer(
+        self,
+        image: np.ndarray | Tensor,
+        state: StreamState | None = None,
+        num_tokens: int | None = None,
+        fov_x: float | Tensor | None = None,
+        force_projection: bool = True,
+        apply_mask: bool = True,
+        stabilize: bool = True,
+    ) -> Prediction:
+        """Geometry of one image, or of a batch of images from independent streams.
+
+        image: H x W x 3 uint8 RGB, or float 3 x H x W RGB in 0..1; a leading B for a batch.
+        state: the previous prediction's state of the same stream(s); None at the first frame.
+        num_tokens: how finely to look; None for the model's default.
+        fov_x: horizontal field of view in degrees when the camera is known (one number or B);
+            None recovers it from the point map.
+        force_projection: points are the depth unprojected with the intrinsics; else the
+            model's own points plus the shift.
+        apply_mask: depth and points are +inf where the prediction is invalid.
+        stabilize: False gives the base model's single-image output, bit for bit.
+        Raises TypeError or ValueError, naming what was wrong, for a bad image, fov_x or state.
+        """
+        batch, single = image_to_batch(image, self.device)
+        affine, state = self.predict_affine(batch, state, num_tokens, stabilize)
+        valid = affine.mask > self.mask_threshold
+        height, width = valid.shape[-2:]
+        focal = None if fov_x is None else focal_from_fov(fov_x, width / height, len(valid))
+        focal, shift = recover_focal_shift(affine.points, valid, focal)
+        intrinsics = intrinsics_from_focal(focal, width / height).to(affine.points)
+        shift = shift.to(affine.points)
+        prediction = assemble(affine, valid, shift, intrinsics, state, force_projection, apply_mask)
+        return first_of_batch(prediction) if single else prediction
+
+
+def assemble(
+    affine: AffinePoints,
+    valid: Tensor,
+    shift: Tensor,
+    intrinsics: Tensor,
+    state: StreamState | None,
+    force_projection: bool = True,
+    apply_mask: bool = True,
+) -> Prediction:
+    """Affine points + the camera that was recovered (or known) -> Prediction, batched.
+
+    valid: B x H x W bool; shift: B; intrinsics: B x 3 x 3 normalised. A pixel that the shift
+    puts behind the camera is no valid pixel.
+    """
+    depth = affine.points[..., 2] + shift[:, None, None]
+    valid = valid & (depth > 0)
+    if force_projection:
+        points = depth_to_points(depth, intrinsics)
+    else:
+        points = torch.cat([affine.points[..., :2], depth[..., None]], dim=-1)
+    if apply_mask:
+        depth = torch.where(valid, depth, torch.inf)
+        points = torch.where(valid[..., None], points, torch.inf)
+    return Prediction(points, depth, valid, intrinsics, state)
+
+
+def first_of_batch(prediction: Prediction) -> Prediction:
+    """A batch of one -> the prediction of that image (the state keeps its leading 1)."""
+    return Prediction(
+        prediction.points[0],
+        prediction.depth[0],
+        prediction.mask[0],
+        prediction.intrinsics[0],
+        prediction.state,
+    )
+
+
+def image_to_batch(
+    image: np.ndarray | Tensor, device: torch.device | str = "cpu"
+) -> tuple[Tensor, bool]:
+    """A caller's image(s) -> (B x 3 x H x W float32 in 0..1 on the device, whether it was one).
+
+    Raises TypeError for something that is no array, ValueError for a wrong shape, an empty
+    image, values that are not finite or not in 0..1.
+    """
+    if isinstance(image, np.ndarray):
+        if image.dtype != np.uint8 and not np.issubdtype(image.dtype, np.floating):
+            raise TypeError(f"image dtype must be uint8 or float, got {image.dtype}")
+        image = torch.from_numpy(np.ascontiguousarray(image))
+    if not isinstance(image, Tensor):
+        raise TypeError(f"image must be a numpy array or a torch tensor, got {type(image)}")
+    shape = tuple(image.shape)
+    if image.dim() not in (3, 4) or 0 in shape:
+        raise ValueError(f"image must be one image or a batch, none of them empty, got {shape}")
+    if image.dtype == torch.uint8:
+        batch = _uint8_to_float(image, device)
+    elif image.dtype.is_floating_point:
+        batch = _checked_float(image, device)
+    else:
+        raise TypeError(f"image dtype must be uint8 or float, got {image.dtype}")
+    return (batch[None], True) if batch.dim() == 3 else (batch, False)
+
+
+def _uint8_to_float(image: Tensor, device: torch.device | str) -> Tensor:
+    if image.shape[-1] != 3:
+        raise ValueError(f"a uint8 image must be H x W x 3 (RGB), got {tuple(image.shape)}")
+    return image.to(device).movedim(-1, -3).to(torch.float32).div_(255)
+
+
+def _checked_float(image: Tensor, device: torch.device | str) -> Tensor:
+    if image.shape[-3] != 3:
+        raise ValueError(f"a float image must be 3 x H x W (RGB in 0..1), got {tuple(image.shape)}")
+    image = image.to(device=device, dtype=torch.float32)
+    low, high = image.aminmax()
+    # Resizing filters overshoot a little; values of another range go far beyond.
+    if not (low > -1 and high < 2):
+        raise ValueError(
+            f"a float image must have finite values in 0..1, got {low:.4g} to {high:.4g}"
+        )
+    return image
+
+
+ModelClass = TypeVar("ModelClass", bound=type[GeometryModel])
+MODEL_TYPES: dict[str, type[GeometryModel]] = {}
+
+
+def register_model(name: str) -> Callable[[ModelClass], ModelClass]:
+    """Class decorator: makes `config["type"] == name` build this class."""
+
+    def enter(cls: ModelClass) -> ModelClass:
+        if name in MODEL_TYPES and MODEL_TYPES[name] is not cls:
+            raise ValueError(f"model type {name!r} is taken by {MODEL_TYPES[name].__name__}")
+        MODEL_TYPES[name] = cls
+        return cls
+
+    return enter

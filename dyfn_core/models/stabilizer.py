@@ -1,0 +1,205 @@
+"""DyFN: take the latent's statistics away, remember, put better ones back (paper, section 3)."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dyfn_core.prediction import StreamState
+
+EPSILON = 1e-5
+EMA_ALPHA = 0.1
+KINDS = ("convgru", "gru")
+FORMS = ("paper", "residual")
+
+
+@dataclass(frozen=True)
+class StabilizerConfig:
+    """Which DyFN.
+
+    kind: "convgru" (the paper's) or "gru" (its ablation, on the pooled latent).
+    hidden: channels of the hidden state; 256 in the released checkpoint.
+    pool: the ConvGRU sees the latent averaged over pool x pool cells; 1 = as released.
+    form: "paper": F' = sigma_t * F_norm + mu_t, statistics replaced by predicted ones;
+        "residual": F' = sigma_F * exp(dg) * F_norm + (mu_F + sigma_F * db), statistics corrected,
+        the identity before training.
+    """
+
+    kind: str = "convgru"
+    hidden: int = 256
+    pool: int = 1
+    form: str = "paper"
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"stabilizer kind {self.kind!r} is unknown, expected one of {KINDS}")
+        if self.form not in FORMS:
+            raise ValueError(f"stabilizer form {self.form!r} is unknown, expected one of {FORMS}")
+        if self.hidden < 1 or self.pool < 1:
+            raise ValueError(
+                f"stabilizer hidden ({self.hidden}) and pool ({self.pool}) must be at least 1"
+            )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as JSON-able values."""
+        return asdict(self)
+
+
+def build_stabilizer(channels: int, config: StabilizerConfig) -> Stabilizer:
+    """A fresh, untrained DyFN for a latent of so many channels."""
+    if config.kind == "gru":
+        return GRUStabilizer(channels, config)
+    return ConvGRUStabilizer(channels, config)
+
+
+class Stabilizer(nn.Module, ABC):
+    """What both variants share: statistics out, statistics in, both per channel."""
+
+    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+        super().__init__()
+        self.channels = channels
+        self.config = config
+
+    def forward(self, features: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
+        """features B x C x h x w, previous state -> stabilized features, next state.
+
+        state=None is the first frame: a zero hidden state. Raises ValueError when the state
+        belongs to another batch, another latent size or another kind of stabilizer.
+        """
+        if features.shape[-2] * features.shape[-1] < 2:
+            raise ValueError(
+                f"a latent of {features.shape[-2]} x {features.shape[-1]} cells has no standard "
+                "deviation; use a larger image or more tokens"
+            )
+        gamma, beta, mean, std, state = self.statistics(features, state)
+        if self.config.form == "residual":
+            # Written so that gamma = beta = 0 is the identity to rounding, without epsilon.
+            scale, offset = gamma.exp(), mean + std * beta
+        else:
+            scale, offset = gamma / (std + EPSILON), beta
+        shift = offset - scale * mean
+        return torch.addcmul(shift[..., None, None], features, scale[..., None, None]), state
+
+    def statistics(
+        self, features: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, StreamState]:
+        """features -> (gamma, beta, mean, std), each B x C, and the next state.
+
+        "paper" form: gamma, beta are the statistics to apply (sigma_t, mu_t). "residual" form:
+        they are the corrections (dg, db). mean, std are the latent's own.
+        """
+        std, mean = torch.std_mean(features, dim=(-2, -1))
+        gamma, beta, state = self.remember(features, mean, std, state)
+        return gamma, beta, mean, std, state
+
+    @abstractmethod
+    def remember(
+        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        """One step of the recurrence -> gamma, beta (B x C), next state."""
+
+    def _previous(self, shape: tuple[int, ...], state: StreamState | None, like: Tensor) -> Tensor:
+        if state is None:
+            return like.new_zeros(shape)
+        if tuple(state.hidden.shape) != shape:
+            raise ValueError(
+                f"the state is of shape {tuple(state.hidden.shape)}, this frame needs {shape}: "
+                "another image size, batch or model; start the stream anew with state=None"
+            )
+        return state.hidden
+
+
+class ConvGRUCell(nn.Module):
+    """A gated recurrent unit whose gates are 3 x 3 convolutions with zero padding."""
+
+    def __init__(self, channels: int, hidden: int) -> None:
+        super().__init__()
+        self.conv_gates = nn.Conv2d(channels + hidden, 2 * hidden, 3, padding=1)
+        self.conv_candidate = nn.Conv2d(channels + hidden, hidden, 3, padding=1)
+
+    def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
+        """x B x C x h x w, hidden B x D x h x w -> next hidden, same shape."""
+        gates = torch.sigmoid(self.conv_gates(torch.cat([x, hidden], dim=1)))
+        reset, update = gates.chunk(2, dim=1)
+        candidate = torch.tanh(self.conv_candidate(torch.cat([x, reset * hidden], dim=1)))
+        return torch.lerp(hidden, candidate, update)
+
+
+class ConvGRUStabilizer(Stabilizer):
+    """The paper's DyFN: h_t = ConvGRU(F_t, h_{t-1}), statistics from 1 x 1 heads, pooled."""
+
+    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+        super().__init__(channels, config)
+        self.conv_gru_cell = ConvGRUCell(channels, config.hidden)
+        self.gamma_head = nn.Conv2d(config.hidden, channels, 1)
+        self.beta_head = nn.Conv2d(config.hidden, channels, 1)
+        nn.init.zeros_(self.gamma_head.weight)
+        nn.init.zeros_(self.beta_head.weight)
+        nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
+        nn.init.zeros_(self.beta_head.bias)  # type: ignore[arg-type]
+
+    def remember(
+        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        x = self._pooled(features)
+        shape = (x.shape[0], self.config.hidden, x.shape[2], x.shape[3])
+        hidden = self.conv_gru_cell(x, self._previous(shape, state, x))
+        average = hidden.mean(dim=(-2, -1), keepdim=True)
+        # A 1 x 1 convolution of the average is the average of the convolution: only softplus
+        # has to see every cell.
+        beta = self.beta_head(average).flatten(1)
+        if self.config.form == "residual":
+            gamma = self.gamma_head(average).flatten(1)
+        else:
+            gamma = F.softplus(self.gamma_head(hidden)).mean(dim=(-2, -1))
+        return gamma, beta, StreamState(hidden)
+
+    def _pooled(self, features: Tensor) -> Tensor:
+        pool = self.config.pool
+        if pool == 1:
+            return features
+        height, width = features.shape[-2:]
+        size = (math.ceil(height / pool), math.ceil(width / pool))
+        return F.adaptive_avg_pool2d(features, size)
+
+
+class GRUStabilizer(Stabilizer):
+    """The paper's ablation: a GRU on the pooled latent corrects a moving average (alpha 0.1).
+
+    The moving average lives in the stream's state, not in the module.
+    """
+
+    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+        super().__init__(channels, config)
+        self.gru_cell = nn.GRUCell(channels, config.hidden)
+        self.gamma_delta_head = nn.Linear(config.hidden, channels)
+        self.beta_delta_head = nn.Linear(config.hidden, channels)
+        for head in (self.gamma_delta_head, self.beta_delta_head):
+            nn.init.zeros_(head.weight)
+            nn.init.zeros_(head.bias)
+
+    def remember(
+        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        shape = (features.shape[0], self.config.hidden)
+        hidden = self.gru_cell(mean, self._previous(shape, state, mean))
+        gamma, beta = self.gamma_delta_head(hidden), self.beta_delta_head(hidden)
+        if self.config.form == "residual":
+            return gamma, beta, StreamState(hidden)
+        ema_mean = _moving_average(None if state is None else state.ema_mean, mean.detach())
+        ema_std = _moving_average(None if state is None else state.ema_std, std.detach())
+        gamma = (ema_std + gamma).clamp(min=EPSILON)
+        return gamma, ema_mean + beta, StreamState(hidden, ema_mean, ema_std)
+
+
+def _moving_average(previous: Tensor | None, now: Tensor) -> Tensor:
+    if previous is None:
+        return now
+    blended = EMA_ALPHA * now + (1 - EMA_ALPHA) * previous
+    return torch.where(previous.isnan(), now, blended)
