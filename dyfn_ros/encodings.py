@@ -1,0 +1,253 @@
+"""Raw pixel encodings of sensor_msgs/Image, decoded to arrays without cv_bridge.
+
+Knows buffers and arrays only: no message types, no rclpy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import cv2
+import numpy as np
+
+
+class MessageError(ValueError):
+    """A message whose content cannot be used; says what was expected."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """The raw image of a message.
+
+    data: 1-D uint8, as it came.
+    step: bytes from one row to the next; any value of at least one row's bytes.
+    """
+
+    data: np.ndarray
+    height: int
+    width: int
+    encoding: str
+    step: int
+    big_endian: bool = False
+
+    def dtype(self, kind: str) -> np.dtype:
+        return np.dtype((">" if self.big_endian else "<") + kind)
+
+
+def _check_size(raster: Raster) -> None:
+    if raster.height < 1 or raster.width < 1:
+        raise MessageError(
+            f"the image is {raster.width} x {raster.height} pixels; both must be at least 1"
+        )
+
+
+def _plane(raster: Raster, start: int, rows: int, row_bytes: int, stride: int) -> np.ndarray:
+    """rows x row_bytes uint8 view of one plane, without the padding of its rows."""
+    return np.lib.stride_tricks.as_strided(
+        raster.data[start:], shape=(rows, row_bytes), strides=(stride, 1), writeable=False
+    )
+
+
+def _check_buffer(raster: Raster, row_bytes: int, full: int, last_padding: int) -> None:
+    """full: bytes that step and height make; drivers may leave the last row's padding away."""
+    if raster.step < row_bytes:
+        raise MessageError(
+            f"step is {raster.step} bytes, but a row of {raster.width} pixels of "
+            f"{raster.encoding} has {row_bytes}"
+        )
+    if raster.data.size not in (full, full - last_padding):
+        raise MessageError(
+            f"data has {raster.data.size} bytes, but {raster.height} rows of step {raster.step} "
+            f"({raster.encoding}, {raster.width} pixels wide) make {full}"
+        )
+
+
+def _rows(raster: Raster, kind: str, channels: int) -> np.ndarray:
+    """H x W x channels in the machine's byte order, for one plane of interleaved pixels."""
+    dtype = raster.dtype(kind)
+    row_bytes = raster.width * channels * dtype.itemsize
+    _check_buffer(raster, row_bytes, raster.step * raster.height, raster.step - row_bytes)
+    rows = np.ascontiguousarray(_plane(raster, 0, raster.height, row_bytes, raster.step))
+    pixels = rows.view(dtype).reshape(raster.height, raster.width, channels)
+    return pixels.astype(dtype.newbyteorder("="), copy=False)
+
+
+def _to_uint8(pixels: np.ndarray) -> np.ndarray:
+    """16 bit over its full range to 8 bit, rounded; 8 bit as it is."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _decode_packed(raster: Raster, kind: str, channels: int, order: list[int]) -> np.ndarray:
+    pixels = _rows(raster, kind, channels)
+    return np.ascontiguousarray(_to_uint8(pixels[..., order]))
+
+
+def _decode_float(raster: Raster) -> np.ndarray:
+    pixels = _rows(raster, "f4", 1)[..., 0]
+    valid = ~np.isnan(pixels)
+    if np.any((pixels[valid] < 0) | (pixels[valid] > 1)):
+        raise MessageError("a 32FC1 colour image must have its values in 0..1 (NaN is black)")
+    grey = np.rint(np.where(valid, pixels, 0) * 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
+
+
+_CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32)
+_SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32)
+
+
+def _decode_bayer(raster: Raster, kind: str, pattern: str) -> np.ndarray:
+    """Bilinear; every sample of the sensor keeps its value, borders use what there is."""
+    if raster.height < 2 or raster.width < 2:
+        raise MessageError(
+            f"{raster.encoding} needs at least 2 x 2 pixels, not {raster.width} x {raster.height}"
+        )
+    mosaic = _rows(raster, kind, 1)[..., 0].astype(np.float32)
+    colours = np.empty((raster.height, raster.width), "U1")
+    for i, colour in enumerate(pattern):
+        colours[i // 2 :: 2, i % 2 :: 2] = colour
+    planes = []
+    for colour in "rgb":
+        mask = (colours == colour).astype(np.float32)
+        kernel = _CROSS if colour == "g" else _SQUARE
+        total = cv2.filter2D(mosaic * mask, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+        weight = cv2.filter2D(mask, -1, kernel, borderType=cv2.BORDER_CONSTANT)
+        planes.append(total / weight)
+    rgb = np.rint(np.stack(planes, axis=2))
+    return _to_uint8(rgb.astype(np.uint16 if kind == "u2" else np.uint8))
+
+
+# ITU-R BT.601, limited range, as cameras and V4L2 mean it.
+_YUV_TO_RGB = np.array(
+    [[1.164384, 0, 1.596027], [1.164384, -0.391762, -0.812968], [1.164384, 2.017232, 0]]
+)
+_YUV_OFFSET = -_YUV_TO_RGB @ np.array([16.0, 128.0, 128.0])
+
+
+def _yuv_to_rgb(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    yuv = np.ascontiguousarray(np.stack([y, u, v], axis=2))
+    return cv2.transform(yuv, np.column_stack([_YUV_TO_RGB, _YUV_OFFSET])).reshape(yuv.shape)
+
+
+def _check_even(raster: Raster, height_too: bool) -> None:
+    if raster.width % 2 or (height_too and raster.height % 2):
+        what = "width and height" if height_too else "width"
+        raise MessageError(
+            f"{raster.encoding} needs an even {what}, not {raster.width} x {raster.height}"
+        )
+
+
+def _decode_yuv422(raster: Raster, luma: int, chroma: int) -> np.ndarray:
+    """luma, chroma: offset of the first Y and of U in the four bytes of two pixels."""
+    _check_even(raster, height_too=False)
+    quads = _rows(raster, "u1", 2).reshape(raster.height, raster.width // 2, 4)
+    y = quads[..., luma::2].reshape(raster.height, raster.width)
+    u = np.repeat(quads[..., chroma], 2, axis=1)
+    v = np.repeat(quads[..., chroma + 2], 2, axis=1)
+    return _yuv_to_rgb(y, u, v)
+
+
+def _luma_stride(raster: Raster, tight: int) -> int:
+    """Bytes from one row of Y to the next.
+
+    Some drivers set step to the bytes of all planes per row; that is clear when the whole
+    buffer is that long and has no padding at all (tight: its bytes then).
+    """
+    if raster.data.size == tight == raster.step * raster.height:
+        return raster.width
+    return raster.step
+
+
+def _decode_nv21(raster: Raster) -> np.ndarray:
+    """Y plane, then VU pairs at half the resolution both ways, in rows of the same step."""
+    _check_even(raster, height_too=True)
+    h, w = raster.height, raster.width
+    stride = _luma_stride(raster, tight=w * h * 3 // 2)
+    if stride == raster.step:
+        _check_buffer(raster, w, full=stride * h * 3 // 2, last_padding=stride - w)
+    y = _plane(raster, 0, h, w, stride)
+    vu = _plane(raster, h * stride, h // 2, w, stride).reshape(h // 2, w // 2, 2)
+    vu = vu.repeat(2, axis=0).repeat(2, axis=1)
+    return _yuv_to_rgb(y, vu[..., 1], vu[..., 0])
+
+
+def _decode_nv24(raster: Raster) -> np.ndarray:
+    """Y plane, then UV pairs at full resolution, in rows of twice the step."""
+    h, w = raster.height, raster.width
+    stride = _luma_stride(raster, tight=w * h * 3)
+    if stride == raster.step:
+        _check_buffer(raster, w, full=stride * h * 3, last_padding=2 * (stride - w))
+    y = _plane(raster, 0, h, w, stride)
+    uv = _plane(raster, h * stride, h, 2 * w, 2 * stride).reshape(h, w, 2)
+    return _yuv_to_rgb(y, uv[..., 0], uv[..., 1])
+
+
+def _decoders() -> dict[str, Callable[[Raster], np.ndarray]]:
+    table: dict[str, Callable[[Raster], np.ndarray]] = {}
+    rgb, bgr, grey = [0, 1, 2], [2, 1, 0], [0, 0, 0]
+    for bits, kind in (("8", "u1"), ("16", "u2")):
+        packed = {
+            f"rgb{bits}": (3, rgb),
+            f"rgba{bits}": (4, rgb),
+            f"bgr{bits}": (3, bgr),
+            f"bgra{bits}": (4, bgr),
+            f"mono{bits}": (1, grey),
+            f"{bits}UC1": (1, grey),
+            f"{bits}UC3": (3, bgr),
+            f"{bits}UC4": (4, bgr),
+        }
+        for name, (channels, order) in packed.items():
+            table[name] = partial(_decode_packed, kind=kind, channels=channels, order=order)
+        for pattern in ("rggb", "bggr", "gbrg", "grbg"):
+            table[f"bayer_{pattern}{bits}"] = partial(_decode_bayer, kind=kind, pattern=pattern)
+    for name in ("uyvy", "yuv422"):
+        table[name] = partial(_decode_yuv422, luma=1, chroma=0)
+    for name in ("yuyv", "yuv422_yuy2"):
+        table[name] = partial(_decode_yuv422, luma=0, chroma=1)
+    table.update({"nv21": _decode_nv21, "nv24": _decode_nv24, "32FC1": _decode_float})
+    return table
+
+
+_DECODERS = _decoders()
+COLOUR_ENCODINGS = tuple(sorted(_DECODERS))
+DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
+
+
+def decode_colour(raster: Raster) -> np.ndarray:
+    """-> H x W x 3 uint8 RGB, a new array.
+
+    16 bit is scaled over its full range; 8UC3 and 8UC4 are BGR(A), as OpenCV means them; YUV is
+    BT.601 limited range; 32FC1 is grey in 0..1.
+
+    Raises MessageError: an encoding not in COLOUR_ENCODINGS, a step shorter than a row, data that
+    does not have the bytes that step and height say, a size of zero, odd YUV sizes.
+    """
+    decoder = _DECODERS.get(raster.encoding)
+    if decoder is None:
+        raise MessageError(
+            f"encoding {raster.encoding!r} is not known; known: {', '.join(COLOUR_ENCODINGS)}"
+        )
+    _check_size(raster)
+    return decoder(raster)
+
+
+def decode_metric_depth(raster: Raster) -> np.ndarray:
+    """-> H x W float32 metres, NaN where there is no depth (REP-118).
+
+    16UC1 and mono16 are millimetres, 0 invalid; 32FC1 is metres, where zero, negative and
+    non-finite values are invalid. Raises MessageError as decode_colour does.
+    """
+    if raster.encoding not in DEPTH_ENCODINGS:
+        raise MessageError(
+            f"encoding {raster.encoding!r} is no depth; known: {', '.join(DEPTH_ENCODINGS)}"
+        )
+    _check_size(raster)
+    if raster.encoding == "32FC1":
+        depth = _rows(raster, "f4", 1)[..., 0].copy()
+    else:
+        depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32) * np.float32(0.001)
+    depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+    return depth
