@@ -1,0 +1,213 @@
+"""The image, video and metric protocols, accumulated one frame at a time (paper section 5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dyfn_core.evaluation.metrics import depth_metrics, mean_metrics
+from dyfn_core.geometry.alignment import fit_scale_shift
+
+MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is clipped to it
+MIN_PIXELS = 16  # frames with fewer scored samples are not scored
+
+
+@dataclass(frozen=True)
+class FrameScore:
+    """One frame under the image protocol.
+
+    coverage: share of the pixels with truth where the prediction is valid.
+    pixels: scored samples. scale, shift: this frame's own alignment; with metrics None when
+        fewer than MIN_PIXELS samples could be scored.
+    """
+
+    coverage: float
+    pixels: int
+    scale: float | None = None
+    shift: float | None = None
+    metrics: dict[str, float] | None = None
+
+
+@dataclass(frozen=True)
+class SequenceScore:
+    """A sequence under one protocol: metrics are means over the scored frames.
+
+    scale, shift: the one alignment of the video protocol (1 and 0 for the metric protocol,
+    medians over frames for the image protocol). frames: each frame's metrics, None if unscored.
+    """
+
+    metrics: dict[str, float]
+    scale: float
+    shift: float
+    frames: list[dict[str, float] | None]
+
+
+class SequenceScorer:
+    """Scores a sequence frame by frame, in memory that does not grow with resolution or length.
+
+    Every frame is sampled on a regular pixel grid of at most samples_per_frame points; fits and
+    scores of all protocols use these same points. When the kept samples of a sequence exceed
+    max_samples, every second one of every frame is dropped, so that the video protocol of a long
+    sequence is fitted and scored on fewer, still evenly spread pixels. Deterministic.
+
+    depth_max: cap in metres: truth beyond it is invalid, aligned depth is clipped to it.
+    Invalid predictions (masked, NaN, infinite, not positive) take no part in fit or score; they
+    lower `coverage` instead of counting as depth 0.
+    """
+
+    def __init__(
+        self,
+        depth_max: float = math.inf,
+        samples_per_frame: int = 20_000,
+        max_samples: int = 4_000_000,
+    ) -> None:
+        self.depth_max = depth_max
+        self.samples_per_frame = samples_per_frame
+        self.max_samples = max_samples
+        self.frames: list[FrameScore] = []
+        self._kept: list[tuple[np.ndarray, np.ndarray]] = []
+        self._step = 1
+        self._total = 0
+
+    def push(
+        self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
+    ) -> FrameScore:
+        """Score one frame under the image protocol and keep its samples for the others.
+
+        prediction: H x W depth up to scale and shift; target: H x W metres, invalid where it is
+        NaN, infinite, <= MIN_DEPTH or > depth_max. mask: H x W bool, where the prediction is
+        valid. Raises ValueError on differing shapes.
+        """
+        p, d, coverage = self._sample(prediction, target, mask)
+        score = FrameScore(coverage, p.size)
+        if p.size >= MIN_PIXELS:
+            scale, shift = fit_scale_shift(p, d, 1 / d)
+            score = FrameScore(coverage, p.size, scale, shift, self._score(p, d, scale, shift))
+        self.frames.append(score)
+        self._keep(p, d)
+        return score
+
+    def image(self) -> SequenceScore | None:
+        """Each frame aligned by its own scale and shift; None when no frame could be scored."""
+        scored = [f for f in self.frames if f.metrics is not None]
+        if not scored:
+            return None
+        scale = float(np.median([f.scale for f in scored if f.scale is not None]))
+        shift = float(np.median([f.shift for f in scored if f.shift is not None]))
+        frames = [f.metrics for f in self.frames]
+        return SequenceScore(mean_metrics([f for f in frames if f]), scale, shift, frames)
+
+    def video(self) -> SequenceScore | None:
+        """One (scale, shift) for the sequence: min sum_j sum_i (1/d) |s p + t - d|."""
+        if not any(p.size >= MIN_PIXELS for p, _ in self._kept):
+            return None
+        target = np.concatenate([d for _, d in self._kept])
+        prediction = np.concatenate([p for p, _ in self._kept])
+        return self._aligned(*fit_scale_shift(prediction, target, 1 / target.astype(np.float64)))
+
+    def metric(self) -> SequenceScore | None:
+        """No alignment: the prediction is taken as metres."""
+        if not any(p.size >= MIN_PIXELS for p, _ in self._kept):
+            return None
+        return self._aligned(1.0, 0.0)
+
+    def _aligned(self, scale: float, shift: float) -> SequenceScore:
+        frames = [
+            self._score(p, d, scale, shift) if p.size >= MIN_PIXELS else None for p, d in self._kept
+        ]
+        return SequenceScore(mean_metrics([f for f in frames if f]), scale, shift, frames)
+
+    def _score(
+        self, prediction: np.ndarray, target: np.ndarray, scale: float, shift: float
+    ) -> dict[str, float]:
+        aligned = np.clip(scale * prediction.astype(np.float64) + shift, MIN_DEPTH, self.depth_max)
+        return depth_metrics(aligned, target)
+
+    def _sample(
+        self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        if prediction.shape != target.shape or (mask is not None and mask.shape != target.shape):
+            raise ValueError(
+                f"prediction {prediction.shape}, target {target.shape} and mask must share a shape"
+            )
+        grid = sample_grid(target.shape, self.samples_per_frame)
+        p, d = prediction[grid].astype(np.float32), target[grid].astype(np.float32)
+        truth = np.isfinite(d) & (d > MIN_DEPTH) & (d <= self.depth_max)
+        valid = truth & np.isfinite(p) & (p > 0)
+        if mask is not None:
+            valid &= mask[grid]
+        coverage = float(valid.sum() / truth.sum()) if truth.any() else 0.0
+        return p[valid], d[valid], coverage
+
+    def _keep(self, prediction: np.ndarray, target: np.ndarray) -> None:
+        self._kept.append((prediction[:: self._step].copy(), target[:: self._step].copy()))
+        self._total += self._kept[-1][0].size
+        if self._total > self.max_samples:
+            self._step *= 2
+            self._kept = [(p[::2].copy(), d[::2].copy()) for p, d in self._kept]
+            self._total = sum(p.size for p, _ in self._kept)
+
+
+def sample_grid(shape: tuple[int, ...], samples: int) -> tuple[slice, slice]:
+    """Every s-th row and column, from s // 2, with s the smallest that gives <= samples points."""
+    height, width = shape
+    step = max(1, math.ceil(math.sqrt(height * width / samples)))
+    return slice(step // 2, None, step), slice(step // 2, None, step)
+
+
+def ramp(shape: tuple[int, int]) -> np.ndarray:
+    """Control: a vertical ramp from 2 (top) to 1 (bottom); what needs no network at all."""
+    height, width = shape
+    return np.repeat(np.linspace(2, 1, height, dtype=np.float32)[:, None], width, axis=1)
+
+
+def constant(shape: tuple[int, int]) -> np.ndarray:
+    """Control: the same depth everywhere."""
+    return np.ones(shape, np.float32)
+
+
+CONTROLS: dict[str, Callable[[tuple[int, int]], np.ndarray]] = {"ramp": ramp, "constant": constant}
+
+
+class ControlledScorer:
+    """A SequenceScorer with the controls scored beside it on the same pixels.
+
+    Print the floors with every result: a low error of an easy scene proves nothing.
+    """
+
+    def __init__(self, depth_max: float = math.inf, control_samples: int = 4_000) -> None:
+        self.scorer = SequenceScorer(depth_max)
+        self.controls = {name: SequenceScorer(depth_max, control_samples) for name in CONTROLS}
+
+    def push(
+        self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
+    ) -> FrameScore:
+        """As SequenceScorer.push."""
+        valid = np.isfinite(prediction) & (prediction > 0)
+        if mask is not None:
+            valid &= mask
+        for name, scorer in self.controls.items():
+            scorer.push(CONTROLS[name](target.shape), target, valid)
+        return self.scorer.push(prediction, target, valid)
+
+
+def spread(frames: list[FrameScore]) -> dict[str, float] | None:
+    """How far scale and shift wander over the frames of a sequence; None under two scored frames.
+
+    log_scale_std: standard deviation of log(scale) over frames with a positive scale;
+    log_scale_max_step: its largest change between neighbours; shift_std: metres;
+    not_positive: frames whose best scale is not positive (the prediction is upside down there).
+    """
+    fits = [(f.scale, f.shift) for f in frames if f.scale is not None and f.shift is not None]
+    log_scale = np.log([s for s, _ in fits if s > 0])
+    if log_scale.size < 2:
+        return None
+    return {
+        "log_scale_std": float(np.std(log_scale)),
+        "log_scale_max_step": float(np.abs(np.diff(log_scale)).max()),
+        "shift_std": float(np.std([t for _, t in fits])),
+        "not_positive": len(fits) - log_scale.size,
+    }
