@@ -1,0 +1,91 @@
+"""Which worlds there are, and the endless seeded stream of shards that they give."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dyfn_core.data.worlds import vary as variation
+from dyfn_core.data.worlds.quake import GameFiles, MapError, load_map
+from dyfn_core.data.worlds.renderer import Renderer
+from dyfn_core.data.worlds.scene import Scene
+from dyfn_core.data.worlds.shards import Photographer, existing_shards, write_shard
+
+HELD_OUT_MAPS = frozenset(
+    {"aggressor", "oa_bases3plus3", "oacmpdm10", "oa_dm4", "czest1tourney", "pul1ctf"}
+)
+HELD_OUT_SEEDS = 10
+CLIP_FPS = 15.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """How much of one kind of world to render, and how.
+
+    clip_frames: length of a clip; 0 renders independent views, `views` of them for each shard.
+    """
+
+    worlds: str
+    shards: int
+    views: int
+    clip_frames: int
+    seed: int
+    size: tuple[int, int]
+
+
+class MapWorlds:
+    """OpenArena's maps, each shard with other textures, tints and scale."""
+
+    def __init__(self, assets: Path) -> None:
+        self.files = GameFiles(sorted(assets.rglob("*.pk3")))
+        self.maps = self.files.maps()
+        self.pool = [
+            image
+            for name in sorted(self.files.members)
+            if name.startswith("textures/") and name.endswith((".jpg", ".tga"))
+            if zlib.crc32(name.encode()) % 4 == 0 and (image := self.files.image(name)) is not None
+        ]
+
+    def scene(self, rng: np.random.Generator, held_out: bool) -> Scene:
+        names = [m for m in self.maps if (Path(m).stem in HELD_OUT_MAPS) == held_out]
+        name = names[rng.integers(len(names))]
+        scene = load_map(self.files, name, float(rng.uniform(30, 60)))
+        if not len(scene.viewpoints):
+            raise MapError(f"{name}: no entity stands in free space")
+        swap = 0.0 if held_out else float(rng.choice([0.0, 0.0, 0.3, 0.8]))
+        return variation.vary(scene, rng, self.pool, swap)
+
+
+def render(job: Job, worlds: MapWorlds, out: Path, report: Callable[[str], None]) -> None:
+    """Writes the job's shards that are not there yet; one in HELD_OUT_SEEDS is held out."""
+    renderer = Renderer(job.size)
+    kind = "clip" if job.clip_frames else "frames"
+    root = out / ("clips" if job.clip_frames else "frames")
+    done = existing_shards(out)
+    for seed in range(job.seed, job.seed + job.shards):
+        held_out = seed % HELD_OUT_SEEDS == 0
+        stem = f"{job.worlds}_{kind}_{seed:07d}"
+        if stem in done:
+            continue
+        rng = np.random.default_rng([zlib.crc32(job.worlds.encode()), bool(job.clip_frames), seed])
+        try:
+            scene = worlds.scene(rng, held_out)
+            photographer = Photographer(renderer, scene, rng)
+            if job.clip_frames:
+                views = photographer.clip(job.clip_frames, job.clip_frames / CLIP_FPS)
+            else:
+                views = photographer.frames(job.views)
+        except (MapError, ValueError) as error:
+            report(f"{stem}: skipped, {error}")
+            continue
+        if len(views) < max(4, job.views // 4):
+            report(f"{stem}: skipped, only {len(views)} views of {scene.name} worth keeping")
+            continue
+        split = "held_out" if held_out else "train"
+        meta = {"world": scene.name, "kind": kind, "split": split, "seed": seed}
+        write_shard(root / stem, views, meta)
+        report(f"{stem}: {scene.name}, {len(views)} views")
