@@ -58,7 +58,12 @@ class GeometryModel(nn.Module, ABC):
 
     config: dict[str, Any]
     mask_threshold: float = 0.5
-    stabilizer: Stabilizer | None = None
+    # No class-level None here: it would hide the registered submodule.
+    stabilizer: Stabilizer | None
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stabilizer = None
 
     @classmethod
     @abstractmethod

@@ -1,0 +1,242 @@
+"""MoGe v1: a DINOv2 encoder, a convolutional head, an affine-invariant point map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dyfn_core.geometry.camera import uv_grid
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, register_model
+from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
+from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
+from dyfn_core.prediction import StreamState
+
+REMAPS = ("linear", "sinh", "exp", "sinh_exp")
+NORMS = ("group_norm", "layer_norm")
+
+
+@dataclass(frozen=True)
+class MoGeConfig:
+    """The architecture; field names and defaults are those of released MoGe v1 checkpoints.
+
+    encoder: "dinov2_vits14", "dinov2_vitb14" or "dinov2_vitl14".
+    intermediate_layers: how many last blocks feed the latent, or which blocks.
+    num_tokens_range: how many tokens it was trained with; the upper end is the default.
+    stabilizer: DyFN on the latent, or None for the plain base model.
+    """
+
+    encoder: str = "dinov2_vitb14"
+    intermediate_layers: int | tuple[int, ...] = 4
+    dim_proj: int = 512
+    dim_upsample: tuple[int, ...] = (256, 128, 128)
+    dim_times_res_block_hidden: int = 1
+    num_res_blocks: int = 1
+    remap_output: str = "linear"
+    res_block_norm: str = "group_norm"
+    num_tokens_range: tuple[int, int] = (1200, 2500)
+    last_res_blocks: int = 0
+    last_conv_channels: int = 32
+    last_conv_size: int = 1
+    mask_threshold: float = 0.5
+    stabilizer: StabilizerConfig | None = None
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("encoder", tuple(SIZES)),
+            ("remap_output", REMAPS),
+            ("res_block_norm", NORMS),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} {getattr(self, name)!r} is unknown, expected {allowed}")
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> MoGeConfig:
+        """From JSON-able values. Raises ValueError that names unknown keys."""
+        known = {field.name for field in fields(MoGeConfig)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise ValueError(f"unknown keys for a MoGe model: {unknown}, known are {sorted(known)}")
+        values = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+        }
+        stabilizer = values.pop("stabilizer", None)
+        if isinstance(stabilizer, dict):
+            try:
+                stabilizer = StabilizerConfig(**stabilizer)
+            except TypeError as error:
+                raise ValueError(f"bad stabilizer config {stabilizer}: {error}") from error
+        return MoGeConfig(**values, stabilizer=stabilizer)
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(relu(norm(conv(relu(norm(x)))))), 3 x 3, replicate padding."""
+
+    def __init__(self, channels: int, hidden: int, norm: str) -> None:
+        super().__init__()
+        groups = hidden // 32 if norm == "group_norm" else 1
+        self.layers = nn.Sequential(
+            nn.GroupNorm(1, channels),
+            nn.ReLU(),
+            nn.Conv2d(channels, hidden, 3, padding=1, padding_mode="replicate"),
+            nn.GroupNorm(groups, hidden),
+            nn.ReLU(),
+            nn.Conv2d(hidden, channels, 3, padding=1, padding_mode="replicate"),
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: B x C x h x w."""
+        return self.layers(x) + x
+
+
+class Head(nn.Module):
+    """Encoder layers -> latent (`fuse`); latent -> raw points and mask (`forward`)."""
+
+    def __init__(self, config: MoGeConfig, num_features: int, encoder_channels: int) -> None:
+        super().__init__()
+        self.projects = nn.ModuleList(
+            nn.Conv2d(encoder_channels, config.dim_proj, 1) for _ in range(num_features)
+        )
+        widths = [config.dim_proj, *config.dim_upsample]
+        self.upsample_blocks = nn.ModuleList(
+            _upsample_block(before, after, config)
+            for before, after in zip(widths[:-1], widths[1:], strict=True)
+        )
+        self.output_block = nn.ModuleList(_output_block(count, config) for count in (3, 1))
+
+    def fuse(self, layers: list[Tensor]) -> Tensor:
+        """Encoder layers, each B x C x h x w -> the latent F, B x dim_proj x h x w."""
+        first, *others = (
+            project(layer) for project, layer in zip(self.projects, layers, strict=True)
+        )
+        for other in others:
+            first = first + other
+        return first
+
+    def forward(self, latent: Tensor, network_size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """latent B x C x h x w -> raw points B x 3 x H x W, raw mask B x 1 x H x W."""
+        aspect = network_size[1] / network_size[0]
+        x = latent
+        for block in self.upsample_blocks:
+            x = block(_with_uv(x, aspect))
+        x = F.interpolate(x, network_size, mode="bilinear", align_corners=False)
+        x = _with_uv(x, aspect)
+        return self.output_block[0](x), self.output_block[1](x)
+
+
+def _with_uv(x: Tensor, aspect: float) -> Tensor:
+    uv = uv_grid((x.shape[-2], x.shape[-1]), aspect, x.dtype, x.device)
+    return torch.cat([x, uv.expand(len(x), -1, -1, -1)], dim=1)
+
+
+def _upsample_block(before: int, after: int, config: MoGeConfig) -> nn.Sequential:
+    enlarge = nn.ConvTranspose2d(before + 2, after, 2, stride=2)
+    with torch.no_grad():
+        enlarge.weight.copy_(enlarge.weight[:, :, :1, :1].expand_as(enlarge.weight).clone())
+    smooth = nn.Conv2d(after, after, 3, padding=1, padding_mode="replicate")
+    hidden = config.dim_times_res_block_hidden * after
+    return nn.Sequential(
+        nn.Sequential(enlarge, smooth),
+        *(
+            ResidualBlock(after, hidden, config.res_block_norm)
+            for _ in range(config.num_res_blocks)
+        ),
+    )
+
+
+def _output_block(count: int, config: MoGeConfig) -> nn.Sequential:
+    width, size = config.last_conv_channels, config.last_conv_size
+    hidden = config.dim_times_res_block_hidden * width
+    return nn.Sequential(
+        nn.Conv2d(config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"),
+        *(ResidualBlock(width, hidden, config.res_block_norm) for _ in range(config.last_res_blocks)),
+        nn.ReLU(),
+        nn.Conv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
+    )
+
+
+def remap_points(raw: Tensor, remap: str) -> Tensor:
+    """Raw head output ... x 3 -> affine-invariant points ... x 3 ("exp": z = e^z, xy = xy * z)."""
+    if remap == "linear":
+        return raw
+    if remap == "sinh":
+        return raw.sinh()
+    xy, z = raw[..., :2], raw[..., 2:].exp()
+    return torch.cat([xy * z if remap == "exp" else xy.sinh(), z], dim=-1)
+
+
+@register_model("moge")
+class MoGe(GeometryModel):
+    """MoGe v1, with or without DyFN on its latent (paper sections 2 and 3)."""
+
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, config: MoGeConfig) -> None:
+        super().__init__()
+        self.architecture = config
+        self.config = {"type": "moge", **asdict(config)}
+        self.mask_threshold = config.mask_threshold
+        self.backbone = DinoV2(config.encoder)
+        blocks = self.backbone.block_indices(config.intermediate_layers)
+        self.head = Head(config, len(blocks), self.backbone.channels)
+        self.register_buffer("image_mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1))
+        self.register_buffer("image_std", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
+        if config.stabilizer is not None:
+            self.set_stabilizer(build_stabilizer(config.dim_proj, config.stabilizer))
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> MoGe:
+        """config: MoGeConfig's fields and "type". ValueError for unknown or bad keys."""
+        return cls(MoGeConfig.from_dict({k: v for k, v in config.items() if k != "type"}))
+
+    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
+        """image B x 3 x H x W in 0..1 -> the summed projections of the last encoder layers."""
+        tokens = self.architecture.num_tokens_range[1] if num_tokens is None else num_tokens
+        size = (image.shape[-2], image.shape[-1])
+        network_size = resized(size, tokens)
+        image = F.interpolate(
+            image, network_size, mode="bicubic", align_corners=False, antialias=True
+        )
+        image = (image - self.image_mean) / self.image_std
+        image = F.interpolate(
+            image, whole_patches(network_size), mode="bilinear", align_corners=False, antialias=True
+        )
+        layers = self.backbone(image, self.architecture.intermediate_layers)
+        return Latent(self.head.fuse(layers), size, network_size)
+
+    def stabilize_latent(
+        self, latent: Latent, state: StreamState | None
+    ) -> tuple[Latent, StreamState | None]:
+        """As released: a stabilized frame is decoded at whole patches, the base is not."""
+        latent, state = super().stabilize_latent(latent, state)
+        return replace(latent, network_size=whole_patches(latent.network_size)), state
+
+    def decode(self, latent: Latent) -> AffinePoints:
+        """Latent -> points and mask at the image's size."""
+        points, mask = self.head(latent.features, latent.network_size)
+        points = F.interpolate(points, latent.image_size, mode="bilinear", align_corners=False)
+        mask = F.interpolate(mask, latent.image_size, mode="bilinear", align_corners=False)
+        points = remap_points(points.movedim(1, -1), self.architecture.remap_output)
+        return AffinePoints(points, mask[:, 0])
+
+
+def resized(size: tuple[int, int], num_tokens: int) -> tuple[int, int]:
+    """(H, W) -> the size of about num_tokens patches and the same aspect, at least one patch.
+
+    Raises ValueError when num_tokens is not positive.
+    """
+    if num_tokens < 1:
+        raise ValueError(f"num_tokens must be at least 1, got {num_tokens}")
+    height, width = size
+    factor = math.sqrt(num_tokens * PATCH**2 / (height * width))
+    return max(PATCH, int(height * factor)), max(PATCH, int(width * factor))
+
+
+def whole_patches(size: tuple[int, int]) -> tuple[int, int]:
+    """(H, W) rounded down to multiples of the patch size."""
+    return size[0] // PATCH * PATCH, size[1] // PATCH * PATCH
