@@ -8,12 +8,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dyfn_core.data.worlds.generate import Job, MapWorlds, render
+from dyfn_core.data.worlds.generate import Job, MapWorlds, RoomWorlds, render
 
 
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="dyfn-worlds", description=__doc__)
     parser.add_argument("--assets", type=Path, required=True, help="folder that holds the art")
+    parser.add_argument("--worlds", choices=("maps", "rooms"), default="maps")
     parser.add_argument("--out", type=Path, required=True, help="folder of shards to add to")
     parser.add_argument("--shards", type=int, default=100, help="shards to render")
     parser.add_argument("--views", type=int, default=24, help="independent views in a shard")
@@ -26,14 +27,18 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     options = parse_arguments(argv)
     height, width = (int(x) for x in options.size.split("x"))
-    job = Job("maps", options.shards, options.views, options.clip_frames, options.seed, (height, width))
+    size = (height, width)
+    job = Job(
+        options.worlds, options.shards, options.views, options.clip_frames, options.seed, size
+    )
+    worlds = {"maps": MapWorlds, "rooms": RoomWorlds}[options.worlds](options.assets)
     with tqdm(total=options.shards, unit="shard", file=sys.stderr) as bar:
 
         def report(line: str) -> None:
             bar.update()
             bar.set_postfix_str(line[-60:])
 
-        render(job, MapWorlds(options.assets), options.out, report)
+        render(job, worlds, options.out, report)
     return 0
 
 

@@ -107,8 +107,8 @@ class Lens:
 
 def random_view(space: FreeSpace, rng: np.random.Generator, lens: Lens) -> Camera:
     """One camera at head or robot height that looks about level, more often down than up."""
-    position = space.sample_point(rng, (0.3, 2.0))
-    pitch = np.radians(np.clip(rng.normal(-12, 16), -70, 35))
+    position = space.sample_point(rng, (0.7, 2.0) if rng.random() < 0.8 else (0.25, 0.7))
+    pitch = np.radians(np.clip(rng.normal(-10, 13), -65, 35))
     roll = np.radians(rng.normal(0, 4))
     return Camera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
 

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.data.worlds import vary as variation
+from dyfn_core.data.worlds.furniture import Showroom
 from dyfn_core.data.worlds.quake import GameFiles, MapError, load_map
 from dyfn_core.data.worlds.renderer import Renderer
+from dyfn_core.data.worlds.rooms import furnished_room
 from dyfn_core.data.worlds.scene import Scene
 from dyfn_core.data.worlds.shards import Photographer, existing_shards, write_shard
 
@@ -48,6 +50,7 @@ class MapWorlds:
             for name in sorted(self.files.members)
             if name.startswith("textures/") and name.endswith((".jpg", ".tga"))
             if zlib.crc32(name.encode()) % 4 == 0 and (image := self.files.image(name)) is not None
+            if np.median(image) > 25
         ]
 
     def scene(self, rng: np.random.Generator, held_out: bool) -> Scene:
@@ -60,7 +63,20 @@ class MapWorlds:
         return variation.vary(scene, rng, self.pool, swap)
 
 
-def render(job: Job, worlds: MapWorlds, out: Path, report: Callable[[str], None]) -> None:
+class RoomWorlds:
+    """Furnished rooms; no two are alike."""
+
+    def __init__(self, assets: Path) -> None:
+        libraries = sorted(assets.rglob("*.sh3f"))
+        self.showroom = Showroom(libraries) if libraries else None
+        archives = sorted(assets.rglob("*.pk3"))
+        self.pool = MapWorlds(assets).pool if archives else []
+
+    def scene(self, rng: np.random.Generator, held_out: bool) -> Scene:
+        return furnished_room(rng, self.showroom, self.pool)
+
+
+def render(job: Job, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable[[str], None]) -> None:
     """Writes the job's shards that are not there yet; one in HELD_OUT_SEEDS is held out."""
     renderer = Renderer(job.size)
     kind = "clip" if job.clip_frames else "frames"

@@ -40,9 +40,14 @@ class MapError(ValueError):
 
 @dataclass(frozen=True)
 class Shader:
-    """What a shader script says about one surface name."""
+    """What a shader script says about one surface name.
+
+    image: of the first stage that has one, often only a glow or an environment map.
+    editor_image: what the map editor shows, the plain material.
+    """
 
     image: str | None
+    editor_image: str | None
     hidden: bool
 
 
@@ -95,8 +100,10 @@ class GameFiles:
             return self.image(name), False
         if shader.hidden:
             return None, True
-        image = self.image(shader.image) if shader.image else None
-        return (image if image is not None else self.image(name)), False
+        for candidate in (shader.editor_image, name, shader.image):
+            if candidate and (image := self.image(candidate)) is not None:
+                return image, False
+        return None, False
 
 
 def decode_image(data: bytes) -> np.ndarray | None:
@@ -177,7 +184,10 @@ def _shader(lines: list[tuple[int, str]]) -> Shader:
             blended = "".join(keys.get("blendfunc", [])) != "gl_onegl_zero"
         if image is None and source and not source[0].startswith("$"):
             image = source[0]
-    return Shader(image, bool(parameters & HIDDEN) or "skyparms" in {w[0] for _, w in words} or blended)
+    globals_ = {w[0]: w[1:] for depth, w in words if depth == 1}
+    editor = (globals_.get("qer_editorimage") or [None])[0]
+    hidden = bool(parameters & HIDDEN) or "skyparms" in globals_ or blended
+    return Shader(image, editor, hidden)
 
 
 def load_map(files: GameFiles, name: str, units_per_metre: float = UNITS_PER_METRE) -> Scene:

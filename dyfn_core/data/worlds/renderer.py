@@ -68,7 +68,7 @@ void main() {
     vec3 light; vec3 shine = vec3(0.0);
     if (lightmap >= 0) {
         light = texture(lightmaps, vec3(lightmap_uv, lightmap)).rgb;
-        light *= 3.0 * light;
+        light = 2.5 * light * light + 0.8 * light + ambient * 0.4;
     } else {
         light = ambient * (0.75 + 0.25 * n.z);
         for (int i = 0; i < light_count; i++) {

@@ -54,10 +54,12 @@ class Photographer:
         solid = np.isfinite(depth)
         if solid.mean() < 0.5 or np.quantile(depth, 0.02) < 0.2:
             return None
-        if np.median(depth[solid]) > 25:
+        low, middle, high = np.quantile(depth[solid], [0.05, 0.5, 0.95])
+        if middle > 25 or (high < 1.7 * low and self.rng.random() < 0.85):
             return None
         mean = max(float(image[solid].mean()), 2.0)
-        if image[solid].std() / mean < 0.08:
+        contrast = image[solid].std() / mean
+        if contrast < 0.08 or (contrast < 0.18 and self.rng.random() < 0.7):
             return None
         return float(np.clip((self.brightness / mean) ** 2, 0.05, 40.0))
 

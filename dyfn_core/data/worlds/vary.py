@@ -12,11 +12,13 @@ from dyfn_core.data.worlds.scene import Scene, fit_texture
 
 def vary(scene: Scene, rng: np.random.Generator, pool: list[np.ndarray], swap: float) -> Scene:
     """A scene with a share `swap` of its textures exchanged for the pool's, tints and sky drawn."""
-    textures = [
-        fit_texture(pool[rng.integers(len(pool))]) if pool and rng.random() < swap else t
-        for t in scene.textures
-    ]
-    textures = [tint(t, rng) for t in textures]
+    textures = []
+    for texture in scene.textures:
+        # mostly black layers are glow maps whose material comes from a later stage
+        swapped = rng.random() < swap or np.median(texture) < 8
+        if pool and swapped:
+            texture = fit_texture(pool[rng.integers(len(pool))])
+        textures.append(tint(texture, rng))
     low = rng.uniform(0.5, 1.0, 3)
     sky = np.stack([low, np.clip(low * rng.uniform(0.5, 1.0) + [0, 0.05, 0.2], 0, 1)])
     return replace(scene, textures=textures, sky=sky.astype(np.float32))
