@@ -81,9 +81,10 @@ def _to_uint8(pixels: np.ndarray) -> np.ndarray:
     return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def _decode_packed(raster: Raster, kind: str, channels: int, order: list[int]) -> np.ndarray:
-    pixels = _rows(raster, kind, channels)
-    return np.ascontiguousarray(_to_uint8(pixels[..., order]))
+def _decode_packed(raster: Raster, kind: str, channels: int, to_rgb: int | None) -> np.ndarray:
+    """to_rgb: OpenCV's conversion code; None when it is RGB already."""
+    pixels = _to_uint8(_rows(raster, kind, channels))
+    return pixels.copy() if to_rgb is None else cv2.cvtColor(pixels, to_rgb)
 
 
 def _decode_float(raster: Raster) -> np.ndarray:
@@ -95,29 +96,28 @@ def _decode_float(raster: Raster) -> np.ndarray:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-_CROSS = np.array([[0, 1, 0], [1, 4, 1], [0, 1, 0]], np.float32)
-_SQUARE = np.array([[1, 2, 1], [2, 4, 2], [1, 2, 1]], np.float32)
+_DEMOSAIC = {
+    "rggb": cv2.COLOR_BayerRGGB2RGB,
+    "bggr": cv2.COLOR_BayerBGGR2RGB,
+    "gbrg": cv2.COLOR_BayerGBRG2RGB,
+    "grbg": cv2.COLOR_BayerGRBG2RGB,
+}
 
 
 def _decode_bayer(raster: Raster, kind: str, pattern: str) -> np.ndarray:
-    """Bilinear; every sample of the sensor keeps its value, borders use what there is."""
+    """Bilinear; every sample of the sensor keeps its value.
+
+    OpenCV copies the outermost ring from the next one; mirroring first (which keeps the pattern)
+    gives the border its own samples back.
+    """
     if raster.height < 2 or raster.width < 2:
         raise MessageError(
             f"{raster.encoding} needs at least 2 x 2 pixels, not {raster.width} x {raster.height}"
         )
-    mosaic = _rows(raster, kind, 1)[..., 0].astype(np.float32)
-    colours = np.empty((raster.height, raster.width), "U1")
-    for i, colour in enumerate(pattern):
-        colours[i // 2 :: 2, i % 2 :: 2] = colour
-    planes = []
-    for colour in "rgb":
-        mask = (colours == colour).astype(np.float32)
-        kernel = _CROSS if colour == "g" else _SQUARE
-        total = cv2.filter2D(mosaic * mask, -1, kernel, borderType=cv2.BORDER_CONSTANT)
-        weight = cv2.filter2D(mask, -1, kernel, borderType=cv2.BORDER_CONSTANT)
-        planes.append(total / weight)
-    rgb = np.rint(np.stack(planes, axis=2))
-    return _to_uint8(rgb.astype(np.uint16 if kind == "u2" else np.uint8))
+    mosaic = _rows(raster, kind, 1)[..., 0]
+    mirrored = cv2.copyMakeBorder(mosaic, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
+    rgb = cv2.cvtColor(mirrored, _DEMOSAIC[pattern])[2:-2, 2:-2]
+    return np.ascontiguousarray(_to_uint8(rgb))
 
 
 # ITU-R BT.601, limited range, as cameras and V4L2 mean it.
@@ -128,7 +128,7 @@ _YUV_OFFSET = -_YUV_TO_RGB @ np.array([16.0, 128.0, 128.0])
 
 
 def _yuv_to_rgb(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    yuv = np.ascontiguousarray(np.stack([y, u, v], axis=2))
+    yuv = np.stack([np.maximum(y, 16), u, v], axis=2)
     return cv2.transform(yuv, np.column_stack([_YUV_TO_RGB, _YUV_OFFSET])).reshape(yuv.shape)
 
 
@@ -187,20 +187,19 @@ def _decode_nv24(raster: Raster) -> np.ndarray:
 
 def _decoders() -> dict[str, Callable[[Raster], np.ndarray]]:
     table: dict[str, Callable[[Raster], np.ndarray]] = {}
-    rgb, bgr, grey = [0, 1, 2], [2, 1, 0], [0, 0, 0]
     for bits, kind in (("8", "u1"), ("16", "u2")):
         packed = {
-            f"rgb{bits}": (3, rgb),
-            f"rgba{bits}": (4, rgb),
-            f"bgr{bits}": (3, bgr),
-            f"bgra{bits}": (4, bgr),
-            f"mono{bits}": (1, grey),
-            f"{bits}UC1": (1, grey),
-            f"{bits}UC3": (3, bgr),
-            f"{bits}UC4": (4, bgr),
+            f"rgb{bits}": (3, None),
+            f"rgba{bits}": (4, cv2.COLOR_RGBA2RGB),
+            f"bgr{bits}": (3, cv2.COLOR_BGR2RGB),
+            f"bgra{bits}": (4, cv2.COLOR_BGRA2RGB),
+            f"mono{bits}": (1, cv2.COLOR_GRAY2RGB),
+            f"{bits}UC1": (1, cv2.COLOR_GRAY2RGB),
+            f"{bits}UC3": (3, cv2.COLOR_BGR2RGB),
+            f"{bits}UC4": (4, cv2.COLOR_BGRA2RGB),
         }
-        for name, (channels, order) in packed.items():
-            table[name] = partial(_decode_packed, kind=kind, channels=channels, order=order)
+        for name, (channels, code) in packed.items():
+            table[name] = partial(_decode_packed, kind=kind, channels=channels, to_rgb=code)
         for pattern in ("rggb", "bggr", "gbrg", "grbg"):
             table[f"bayer_{pattern}{bits}"] = partial(_decode_bayer, kind=kind, pattern=pattern)
     for name in ("uyvy", "yuv422"):
