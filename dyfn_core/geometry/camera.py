@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 SAMPLES = 64
-_GRID = np.concatenate([np.geomspace(1e-3, 1e3, 37), [math.inf]])
+# Distances of the nearest sample after the shift that are tried first, in units of the depth
+# range: falling, so that q rises.
+_GRID = np.geomspace(1e4, 1e-4, 49)
 
 
 def normalize_intrinsics(camera_matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -205,24 +207,24 @@ def solve_focal_shift(xyz: np.ndarray, uv: np.ndarray, focal: float | None = Non
     if len(xyz) < 2:
         return unknown
     z = xyz[:, 2]
-    centre = float(z.mean())
-    objective = _Objective(
-        np.einsum("ij,ij->i", xyz[:, :2], uv), np.square(xyz[:, :2]).sum(1), z - centre, focal
-    )
-    nearest = centre - float(z.min())
-    unit = nearest if nearest > 1e-9 * max(abs(centre), 1e-30) else max(abs(centre), 1e-12)
-    q = np.append(1 / (nearest + unit * _GRID[::-1]), 1 / centre if centre > 0 else 0.0)
-    q = np.unique(np.clip(q, 0.0, 1 / (nearest + unit * _GRID[0])))
-    values = np.array([objective.value(one) for one in q])
-    best = int(values.argmin())
-    if not values[best] < 0:
-        return unknown
-    if centre > 0 and nearest <= 1e-9 * centre and focal is None:
-        q_best = 1 / centre  # a fronto-parallel plane: focal and shift say the same thing
+    centre, nearest = float(z.mean()), float(z.min())
+    flat = centre - nearest <= 1e-9 * abs(centre)
+    if flat and focal is None:  # a fronto-parallel plane: focal and shift say the same thing
+        grid = np.array([1 / nearest]) if nearest > 0 else np.empty(0)
     else:
-        q_best = _root(objective, q[max(best - 1, 0)], q[min(best + 1, len(q) - 1)], q[best])
-    q_best = max(q_best, q[q > 0][0])
-    return FocalShift(objective.focal(q_best), 1 / q_best - centre, True)
+        unit = abs(centre) if flat else centre - nearest
+        grid = 1 / (centre - nearest + max(unit, 1e-12) * _GRID)
+    objective = _Objective(
+        np.einsum("ij,ij->i", xyz[:, :2], uv),
+        np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2]),
+        z - centre,
+        focal,
+    )
+    values = objective.on_grid(grid)
+    if not len(grid) or not values.min() < 0:
+        return unknown
+    q = _valley(objective, grid, int(values.argmin()))
+    return FocalShift(objective.focal(q), 1 / q - centre, True)
 
 
 @dataclass(frozen=True)
@@ -238,12 +240,16 @@ class _Objective:
         c = 1 / (1 + q * self.dz)
         return float(self.along @ c), float(self.square @ (c * c)), c
 
-    def value(self, q: float) -> float:
-        a, b, _ = self._sums(q)
+    def on_grid(self, q: np.ndarray) -> np.ndarray:
+        """Values at every q, from a quarter of the samples: enough to find the valley."""
+        step = 4 if len(self.dz) >= 1024 else 1
+        c = 1 / (1 + q[:, None] * self.dz[::step])
+        a, b = c @ self.along[::step], (c * c) @ self.square[::step]
         if self.known is not None:
             scale = self.known * q
             return scale * (scale * b - 2 * a)
-        return -a * a / b if a > 0 and b > 0 else 0.0
+        usable = (a > 0) & (b > 0)
+        return np.where(usable, -a * a / np.where(usable, b, 1.0), 0.0)
 
     def slope(self, q: float) -> float:
         a, b, c = self._sums(q)
@@ -261,25 +267,30 @@ class _Objective:
         return a / b / q
 
 
-def _root(objective: _Objective, low: float, high: float, start: float) -> float:
-    """The zero of the slope between low and high (Illinois); `start` when there is none."""
-    f_low, f_high = objective.slope(low), objective.slope(high)
-    if not (f_low < 0 < f_high):
-        return start
-    side = 0
+def _valley(objective: _Objective, grid: np.ndarray, best: int) -> float:
+    """The minimum next to grid[best]: the zero of the slope, bracketed by grid points."""
+    low = high = best
+    while low > 0 and objective.slope(grid[low]) >= 0:
+        low -= 1
+    high = max(high, low)
+    while high < len(grid) - 1 and objective.slope(grid[high]) <= 0:
+        high += 1
+    return _illinois(objective, float(grid[low]), float(grid[high]))
+
+
+def _illinois(objective: _Objective, low: float, high: float) -> float:
+    """The zero of the slope in [low, high]; the lower end when the slope does not change sign."""
+    slope_low, slope_high = objective.slope(low), objective.slope(high)
+    if not slope_low < 0 < slope_high:
+        return high if slope_high < 0 else low
     for _ in range(60):
-        middle = (low * f_high - high * f_low) / (f_high - f_low)
-        if not low < middle < high:
-            return low if side > 0 else high
-        f_middle = objective.slope(middle)
-        if abs(high - low) <= 1e-14 * high or f_middle == 0:
-            return middle
-        if f_middle < 0:
-            low, f_low = middle, f_middle
-            f_high = f_high / 2 if side < 0 else f_high
-            side = -1
+        middle = (low * slope_high - high * slope_low) / (slope_high - slope_low)
+        slope = objective.slope(middle)
+        if slope == 0 or not low < middle < high or high - low <= 1e-13 * high:
+            break
+        if slope < 0:
+            # Halving the slope of an end that stays keeps that end moving (Illinois).
+            low, slope_low, slope_high = middle, slope, slope_high / 2
         else:
-            high, f_high = middle, f_middle
-            f_low = f_low / 2 if side > 0 else f_low
-            side = 1
+            high, slope_high, slope_low = middle, slope, slope_low / 2
     return middle

@@ -1,1 +1,13 @@
 """Image -> latent -> (DyFN) -> latent -> points."""
+
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.checkpoints import CheckpointError, load_model, save_model
+
+__all__ = [
+    "AffinePoints",
+    "CheckpointError",
+    "GeometryModel",
+    "Latent",
+    "load_model",
+    "save_model",
+]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,13 +49,11 @@ class AffinePoints:
 class GeometryModel(nn.Module, ABC):
     """An encoder and a decoder around one latent, with DyFN in between.
 
-    config: everything that builds the model again, JSON-able, with its registered "type"; the
-        stabilizer's part is under "stabilizer" (StabilizerConfig.to_dict(), or None).
     stabilizer: the DyFN module, or None for a plain base model. Its parameters are
         "stabilizer.*" in the state dict of every model.
+    mask_threshold: a pixel is valid where the raw mask exceeds it.
     """
 
-    config: dict[str, Any]
     mask_threshold: float = 0.5
     # No class-level None here: it would hide the registered submodule.
     stabilizer: Stabilizer | None
@@ -68,7 +65,21 @@ class GeometryModel(nn.Module, ABC):
     @classmethod
     @abstractmethod
     def from_config(cls, config: dict[str, Any]) -> GeometryModel:
-        """The model that `config` describes, untrained. ValueError for unknown or bad keys."""
+        """The base model that `config` describes, untrained and without a stabilizer.
+
+        The entries "type" and "stabilizer" are not for this class. Raises ValueError or
+        TypeError for unknown or bad keys.
+        """
+
+    @property
+    @abstractmethod
+    def config(self) -> dict[str, Any]:
+        """JSON-able values with the registered "type", from which from_config builds it again."""
+
+    @property
+    @abstractmethod
+    def latent_channels(self) -> int:
+        """C of the latent."""
 
     @abstractmethod
     def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
@@ -92,12 +103,6 @@ class GeometryModel(nn.Module, ABC):
         """One streaming step on a latent; what inference does between encode and decode."""
         features, state = self.stabilize(latent.features, state)
         return replace(latent, features=features), state
-
-    def set_stabilizer(self, stabilizer: Stabilizer | None) -> None:
-        """Put a DyFN in (or take it out), keeping `config` in step."""
-        self.stabilizer = stabilizer
-        described = None if stabilizer is None else stabilizer.config.to_dict()
-        self.config = {**self.config, "stabilizer": described}
 
     @property
     def device(self) -> torch.device:
@@ -238,19 +243,3 @@ def _checked_float(image: Tensor, device: torch.device | str) -> Tensor:
             f"a float image must have finite values in 0..1, got {low:.4g} to {high:.4g}"
         )
     return image
-
-
-ModelClass = TypeVar("ModelClass", bound=type[GeometryModel])
-MODEL_TYPES: dict[str, type[GeometryModel]] = {}
-
-
-def register_model(name: str) -> Callable[[ModelClass], ModelClass]:
-    """Class decorator: makes `config["type"] == name` build this class."""
-
-    def enter(cls: ModelClass) -> ModelClass:
-        if name in MODEL_TYPES and MODEL_TYPES[name] is not cls:
-            raise ValueError(f"model type {name!r} is taken by {MODEL_TYPES[name].__name__}")
-        MODEL_TYPES[name] = cls
-        return cls
-
-    return enter

@@ -133,7 +133,9 @@ class DinoV2(nn.Module):
         depth = len(self.blocks)
         wanted = list(range(depth - layers, depth)) if isinstance(layers, int) else list(layers)
         if not wanted or min(wanted) < 0 or max(wanted) >= depth:
-            raise ValueError(f"intermediate layers {layers} do not fit an encoder of {depth} blocks")
+            raise ValueError(
+                f"intermediate layers {layers} do not fit an encoder of {depth} blocks"
+            )
         return wanted
 
     def _position_embedding(self, grid: tuple[int, int]) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -11,9 +12,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, register_model
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 from dyfn_core.prediction import StreamState
 
 REMAPS = ("linear", "sinh", "exp", "sinh_exp")
@@ -27,7 +27,6 @@ class MoGeConfig:
     encoder: "dinov2_vits14", "dinov2_vitb14" or "dinov2_vitl14".
     intermediate_layers: how many last blocks feed the latent, or which blocks.
     num_tokens_range: how many tokens it was trained with; the upper end is the default.
-    stabilizer: DyFN on the latent, or None for the plain base model.
     """
 
     encoder: str = "dinov2_vitb14"
@@ -43,7 +42,6 @@ class MoGeConfig:
     last_conv_channels: int = 32
     last_conv_size: int = 1
     mask_threshold: float = 0.5
-    stabilizer: StabilizerConfig | None = None
 
     def __post_init__(self) -> None:
         for name, allowed in (
@@ -61,16 +59,10 @@ class MoGeConfig:
         unknown = sorted(set(values) - known)
         if unknown:
             raise ValueError(f"unknown keys for a MoGe model: {unknown}, known are {sorted(known)}")
-        values = {
+        frozen: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
         }
-        stabilizer = values.pop("stabilizer", None)
-        if isinstance(stabilizer, dict):
-            try:
-                stabilizer = StabilizerConfig(**stabilizer)
-            except TypeError as error:
-                raise ValueError(f"bad stabilizer config {stabilizer}: {error}") from error
-        return MoGeConfig(**values, stabilizer=stabilizer)
+        return MoGeConfig(**frozen)
 
 
 class ResidualBlock(nn.Module):
@@ -103,8 +95,7 @@ class Head(nn.Module):
         )
         widths = [config.dim_proj, *config.dim_upsample]
         self.upsample_blocks = nn.ModuleList(
-            _upsample_block(before, after, config)
-            for before, after in zip(widths[:-1], widths[1:], strict=True)
+            _upsample_block(before, after, config) for before, after in pairwise(widths)
         )
         self.output_block = nn.ModuleList(_output_block(count, config) for count in (3, 1))
 
@@ -153,7 +144,10 @@ def _output_block(count: int, config: MoGeConfig) -> nn.Sequential:
     hidden = config.dim_times_res_block_hidden * width
     return nn.Sequential(
         nn.Conv2d(config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"),
-        *(ResidualBlock(width, hidden, config.res_block_norm) for _ in range(config.last_res_blocks)),
+        *(
+            ResidualBlock(width, hidden, config.res_block_norm)
+            for _ in range(config.last_res_blocks)
+        ),
         nn.ReLU(),
         nn.Conv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
     )
@@ -169,7 +163,6 @@ def remap_points(raw: Tensor, remap: str) -> Tensor:
     return torch.cat([xy * z if remap == "exp" else xy.sinh(), z], dim=-1)
 
 
-@register_model("moge")
 class MoGe(GeometryModel):
     """MoGe v1, with or without DyFN on its latent (paper sections 2 and 3)."""
 
@@ -179,20 +172,28 @@ class MoGe(GeometryModel):
     def __init__(self, config: MoGeConfig) -> None:
         super().__init__()
         self.architecture = config
-        self.config = {"type": "moge", **asdict(config)}
         self.mask_threshold = config.mask_threshold
         self.backbone = DinoV2(config.encoder)
         blocks = self.backbone.block_indices(config.intermediate_layers)
         self.head = Head(config, len(blocks), self.backbone.channels)
         self.register_buffer("image_mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1))
         self.register_buffer("image_std", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
-        if config.stabilizer is not None:
-            self.set_stabilizer(build_stabilizer(config.dim_proj, config.stabilizer))
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> MoGe:
-        """config: MoGeConfig's fields and "type". ValueError for unknown or bad keys."""
-        return cls(MoGeConfig.from_dict({k: v for k, v in config.items() if k != "type"}))
+        """config: MoGeConfig's fields. ValueError for unknown or bad keys."""
+        own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
+        return cls(MoGeConfig.from_dict(own))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """MoGeConfig's fields and the type."""
+        return {"type": "moge", **asdict(self.architecture)}
+
+    @property
+    def latent_channels(self) -> int:
+        """Channels of the summed projections."""
+        return self.architecture.dim_proj
 
     def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
         """image B x 3 x H x W in 0..1 -> the summed projections of the last encoder layers."""
