@@ -127,14 +127,14 @@ class RecordingWriter:
 
     def write_image(self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str) -> None:
         """image: H x W x 3 uint8 RGB, written raw as rgb8."""
-        self.write(topic, IMAGE, _image(image, "rgb8", stamp_ns, frame_id), stamp_ns)
+        self.write(topic, IMAGE, image_message(image, "rgb8", stamp_ns, frame_id), stamp_ns)
 
     def write_jpeg(
         self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str, quality: int = 90
     ) -> None:
         """image: H x W x 3 uint8 RGB, written as a JPEG CompressedImage."""
         data = _encode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-        message = _compressed(data, "rgb8; jpeg compressed bgr8", stamp_ns, frame_id)
+        message = compressed_message(data, "rgb8; jpeg compressed bgr8", stamp_ns, frame_id)
         self.write(topic, COMPRESSED_IMAGE, message, stamp_ns)
 
     def write_depth(
@@ -152,14 +152,16 @@ class RecordingWriter:
         """
         if encoding == "32FC1":
             metres = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
-            self.write(topic, IMAGE, _image(metres, "32FC1", stamp_ns, frame_id), stamp_ns)
+            self.write(topic, IMAGE, image_message(metres, "32FC1", stamp_ns, frame_id), stamp_ns)
             return
         millimetres = depth_to_millimetres(depth)
         if encoding == "16UC1":
-            self.write(topic, IMAGE, _image(millimetres, "16UC1", stamp_ns, frame_id), stamp_ns)
+            self.write(
+                topic, IMAGE, image_message(millimetres, "16UC1", stamp_ns, frame_id), stamp_ns
+            )
             return
         data = _encode(".png", millimetres, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-        message = _compressed(data, "16UC1; png compressed", stamp_ns, frame_id)
+        message = compressed_message(data, "16UC1; png compressed", stamp_ns, frame_id)
         self.write(topic, COMPRESSED_IMAGE, message, stamp_ns)
 
     def write_camera_info(
@@ -302,7 +304,8 @@ def _new(kind: str, **fields: Any) -> Any:
     return TYPES.types[kind](**fields)
 
 
-def _image(pixels: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Any:
+def image_message(pixels: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Any:
+    """A raw Image of H x W (x C) pixels, whose dtype must be that of the encoding."""
     pixels = np.ascontiguousarray(pixels)
     return _new(
         IMAGE,
@@ -316,7 +319,8 @@ def _image(pixels: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> A
     )
 
 
-def _compressed(data: np.ndarray, layout: str, stamp_ns: int, frame_id: str) -> Any:
+def compressed_message(data: np.ndarray, layout: str, stamp_ns: int, frame_id: str) -> Any:
+    """A CompressedImage of encoded bytes (1-D uint8)."""
     return _new(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=layout, data=data)
 
 

@@ -1,0 +1,123 @@
+"""Which topics of a recording are the camera, its calibration, and its ground truth."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from dyfn_ros.compressed_depth import is_compressed_depth
+from dyfn_ros.recording_writer import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, RecordingError
+from dyfn_ros.storage import Storage
+
+NONE = "none"  # what a user writes to do without a topic
+DEPTH_ENCODINGS = {"16UC1", "32FC1"}
+TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
+
+
+@dataclass(frozen=True)
+class Topics:
+    """image: colour, raw or compressed. camera_info, depth: None to do without."""
+
+    image: str
+    camera_info: str | None
+    depth: str | None
+
+
+def choose_topics(
+    path: Path,
+    storage: Storage,
+    image: str | None = None,
+    camera_info: str | None = None,
+    depth: str | None = None,
+) -> Topics:
+    """Take the named topics, and find the others by type when there is one candidate.
+
+    An image counts as depth when its encoding is 16UC1 or 32FC1 (mono16 when its name says
+    depth). A topic recorded both raw and compressed is one candidate: the raw one. Of several
+    CameraInfos, the sibling of the image topic is taken. Raises RecordingError: a named topic
+    that is absent or of another type, no image topic, several candidates.
+    """
+    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    colours, depths = _classify(storage, kinds)
+    images = {IMAGE, COMPRESSED_IMAGE}
+    chosen = _named(path, kinds, image, images) or _only(path, kinds, colours, "image")
+    if chosen is None:
+        raise RecordingError(f"{path}: no colour image topic; it holds {_listing(kinds, kinds)}")
+    return Topics(
+        image=chosen,
+        camera_info=_optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen)),
+        depth=_optional(path, kinds, depth, images, [d for d in depths if d != chosen]),
+    )
+
+
+def _optional(
+    path: Path, kinds: dict[str, str], name: str | None, types: set[str], candidates: list[str]
+) -> str | None:
+    if name == NONE:
+        return None
+    what = "camera-info" if types == {CAMERA_INFO} else "depth"
+    return _named(path, kinds, name, types) or _only(path, kinds, candidates, what)
+
+
+def _named(path: Path, kinds: dict[str, str], name: str | None, types: set[str]) -> str | None:
+    """The topic a user named; the base name of a compressed topic will do."""
+    if name is None:
+        return None
+    for known in (name, f"{name}/compressed", f"{name}/compressedDepth"):
+        if kinds.get(known) in types:
+            return known
+    expected = " or ".join(sorted(types))
+    if name in kinds:
+        raise RecordingError(f"{path}: topic {name} is {kinds[name]}, expected {expected}")
+    raise RecordingError(
+        f"{path}: no topic {name}, expected one of {_listing(kinds, kinds)} that is {expected}"
+    )
+
+
+def _only(path: Path, kinds: dict[str, str], candidates: list[str], what: str) -> str | None:
+    if len(candidates) > 1:
+        raise RecordingError(
+            f"{path}: several topics may be the {what}; choose one with --{what}-topic: "
+            f"{_listing(kinds, candidates)}"
+        )
+    return candidates[0] if candidates else None
+
+
+def _listing(kinds: dict[str, str], names: list[str] | dict[str, str]) -> str:
+    return ", ".join(f"{name} ({kinds[name]})" for name in sorted(names)) or "no messages"
+
+
+def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[str]]:
+    """Colour and depth candidates, by the first message of each image topic."""
+    colours: list[str] = []
+    depths: list[str] = []
+    for name, kind in sorted(kinds.items()):
+        if kind not in (IMAGE, COMPRESSED_IMAGE):
+            continue
+        message = next(iter(storage.messages([name]))).message()
+        if kind == IMAGE:
+            named = message.encoding == "mono16" and "depth" in name
+            is_depth = message.encoding in DEPTH_ENCODINGS or named
+        else:
+            is_depth = is_compressed_depth(message)
+        if is_depth:
+            depths.append(name)
+        elif "depth" not in name and "disparity" not in name:
+            colours.append(name)  # a coloured picture of depth is neither
+    return _raw_first(colours), _raw_first(depths)
+
+
+def _raw_first(names: list[str]) -> list[str]:
+    """Drop the compressed twins of raw topics, and compressedDepth beside compressed."""
+    kept: dict[str, str] = {}
+    for name in sorted(names, key=lambda n: (len(TRANSPORTS.findall(n)), n)):
+        kept.setdefault(TRANSPORTS.sub("", name), name)
+    return sorted(kept.values())
+
+
+def _infos(kinds: dict[str, str], image: str) -> list[str]:
+    """CameraInfo candidates; the image's sibling alone when it is there."""
+    infos = [name for name, kind in kinds.items() if kind == CAMERA_INFO]
+    sibling = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/camera_info"
+    return [sibling] if sibling in infos else sorted(infos)
