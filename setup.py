@@ -38,7 +38,7 @@ setup(
         "tqdm>=4.66",
         "matplotlib>=3.7",
         "huggingface_hub>=0.23",
-        "rosbags>=0.10",
+        "rosbags>=0.11",
         "mcap>=1.1",
     ],
     # ROS from wheels is an extra: on a machine with an apt-installed ROS 2 it must not be pulled in.
