@@ -1,0 +1,35 @@
+"""The angle between predicted and true surface normals (paper section 4)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from dyfn_core.losses.target import Target
+
+SMALLEST, LARGEST = math.radians(1), math.radians(90)
+HUBER = math.radians(3)
+
+
+def normal_loss(points: Tensor, target: Target) -> Tensor:
+    """Mean Huber loss of the angles, clamped to 1..90 degrees, over quads of valid neighbours.
+
+    points: B x H x W x 3. Normals are cross products of the differences to the right and lower
+    neighbour, which no scale or shift changes.
+    """
+    ours, theirs = _normals(points), _normals(target.points)
+    valid = target.valid[:, :-1, :-1] & target.valid[:, 1:, :-1] & target.valid[:, :-1, 1:]
+    # atan2 keeps a useful gradient at small angles, where acos has none.
+    sine = torch.linalg.cross(ours, theirs).square().sum(-1).add(1e-12).sqrt()
+    angle = torch.atan2(sine, (ours * theirs).sum(-1)).clamp(SMALLEST, LARGEST)
+    loss = F.huber_loss(angle, torch.zeros_like(angle), reduction="none", delta=HUBER) / HUBER
+    return (loss * valid).sum() / valid.sum().clamp(min=1)
+
+
+def _normals(points: Tensor) -> Tensor:
+    corner = points[:, :-1, :-1]
+    down, right = points[:, 1:, :-1] - corner, points[:, :-1, 1:] - corner
+    return F.normalize(torch.linalg.cross(down, right), dim=-1, eps=1e-12)

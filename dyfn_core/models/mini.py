@@ -1,0 +1,258 @@
+"""`mini`: the small geometry model for a robot's CPU, MoGe's design around EfficientNet-Lite0.
+
+Encoder features at strides 8, 16 and 32 are projected and summed at stride 8: the latent F, the
+only thing that the decoder sees. The decoder is MoGe's in small: normalised view-plane
+coordinates before each stage, upsampling, residual blocks, separate outputs for points and mask.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.efficientnet import (
+    FEATURE_CHANNELS,
+    IMAGE_MEAN,
+    IMAGE_STD,
+    EfficientNetLite0,
+    imagenet_weights,
+)
+
+CELL = 16  # pixels along the side of one token of the budget
+MULTIPLE = 32  # network sizes are multiples of the encoder's largest stride
+LATENT_STRIDE = 8
+
+
+@dataclass(frozen=True)
+class MiniConfig:
+    """What decides the shape of a MiniModel.
+
+    latent_channels: C of the latent. stage_channels: the decoder's channels at strides 8, 4, ...,
+    one stage each; the outputs come from the last, at twice its resolution. context_channels, context_layers,
+    context_heads: the transformer on the stride-32 map. num_tokens: default budget, in cells of
+    16 x 16 pixels (300 = 320 x 240). folded: the encoder's normalisation is part of its weights.
+    """
+
+    latent_channels: int = 96
+    stage_channels: tuple[int, ...] = (96, 48)
+    context_channels: int = 192
+    context_layers: int = 2
+    context_heads: int = 6
+    num_tokens: int = 300
+    folded: bool = True
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(relu(conv(relu(norm(x)))))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(max(1, channels // 32), channels)
+        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        nn.init.normal_(self.second.weight, std=1e-3)
+        nn.init.zeros_(self.second.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(F.relu(self.first(F.relu(self.norm(x)))))
+
+
+class ContextLayer(nn.Module):
+    """Pre-norm transformer layer with a depthwise convolution as positional encoding."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.position = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
+        self.norm_attention = nn.LayerNorm(channels)
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.out = nn.Linear(channels, channels)
+        self.norm_mlp = nn.LayerNorm(channels)
+        self.mlp = nn.Sequential(
+            nn.Linear(channels, 2 * channels), nn.GELU(), nn.Linear(2 * channels, channels)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        batch, channels, height, width = x.shape
+        x = x + self.position(x)
+        tokens = x.flatten(2).transpose(1, 2)
+        qkv = self.qkv(self.norm_attention(tokens))
+        q, k, v = qkv.view(batch, -1, 3, self.heads, channels // self.heads).permute(2, 0, 3, 1, 4)
+        mixed = F.scaled_dot_product_attention(q, k, v)
+        tokens = tokens + self.out(mixed.transpose(1, 2).reshape(batch, -1, channels))
+        tokens = tokens + self.mlp(self.norm_mlp(tokens))
+        return tokens.transpose(1, 2).reshape(batch, channels, height, width)
+
+
+class Neck(nn.Module):
+    """Encoder features -> latent: context on the deepest map, projections, sum at stride 8."""
+
+    def __init__(self, config: MiniConfig) -> None:
+        super().__init__()
+        fine, middle, deep = FEATURE_CHANNELS
+        self.context_in = nn.Conv2d(deep, config.context_channels, 1)
+        self.context = nn.Sequential(
+            *(
+                ContextLayer(config.context_channels, config.context_heads)
+                for _ in range(config.context_layers)
+            )
+        )
+        channels = config.latent_channels
+        self.project_fine = nn.Conv2d(fine, channels, 1)
+        self.project_middle = nn.Conv2d(middle, channels, 1)
+        self.project_deep = nn.Conv2d(config.context_channels, channels, 1)
+
+    def forward(self, features: list[Tensor]) -> Tensor:
+        fine, middle, deep = features
+        size = fine.shape[-2:]
+        deep = self.project_deep(self.context(self.context_in(deep)))
+        coarse = self.project_middle(middle) + _resize(deep, middle.shape[-2:])
+        return self.project_fine(fine) + _resize(coarse, size)
+
+
+class Decoder(nn.Module):
+    """Latent -> raw points (3) and mask (1) at twice the resolution of the last stage."""
+
+    def __init__(self, config: MiniConfig) -> None:
+        super().__init__()
+        joins, stages = [], []
+        channels = config.latent_channels
+        for width in config.stage_channels:
+            joins.append(nn.Conv2d(channels + 2, width, 1))
+            stages.append(ResidualBlock(width))
+            channels = width
+        self.joins, self.stages = nn.ModuleList(joins), nn.ModuleList(stages)
+        self.points = nn.Sequential(
+            nn.Conv2d(channels + 2, 32, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(32, 3 * 4, 1),
+            nn.PixelShuffle(2),
+        )
+        self.mask = nn.Sequential(
+            nn.Conv2d(channels + 2, 16, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(16, 4, 1),
+            nn.PixelShuffle(2),
+        )
+
+    def forward(self, latent: Tensor, aspect: float) -> tuple[Tensor, Tensor]:
+        x = latent
+        for index, (join, stage) in enumerate(zip(self.joins, self.stages, strict=True)):
+            x = join(_with_view_plane(x, aspect))
+            if index > 0:
+                x = _resize(x, (x.shape[-2] * 2, x.shape[-1] * 2))
+            x = stage(x)
+        x = _with_view_plane(x, aspect)
+        return self.points(x), self.mask(x)
+
+
+class MiniModel(GeometryModel):
+    """The small model; `config` rebuilds it, `stabilizer` is DyFN or None."""
+
+    mask_threshold = 0.5
+
+    def __init__(self, config: MiniConfig | None = None) -> None:
+        super().__init__()
+        self.settings = config or MiniConfig()
+        self.encoder = EfficientNetLite0(folded=self.settings.folded)
+        self.neck = Neck(self.settings)
+        self.decoder = Decoder(self.settings)
+        self.stabilizer = None
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> MiniModel:
+        """The model of a checkpoint's config; `type` and `stabilizer` are not for this class."""
+        fields = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
+        if "stage_channels" in fields:
+            fields["stage_channels"] = tuple(fields["stage_channels"])
+        return cls(MiniConfig(**fields))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values that from_config rebuilds this model from."""
+        fields = asdict(self.settings)
+        return {"type": "mini", **fields, "stage_channels": list(fields["stage_channels"])}
+
+    @property
+    def latent_channels(self) -> int:
+        return self.settings.latent_channels
+
+    def load_imagenet_encoder(self) -> None:
+        """Start the encoder from the ImageNet weights (FileNotFoundError when not installed)."""
+        self.encoder.load_imagenet(imagenet_weights())
+
+    def folded(self) -> MiniModel:
+        """A copy whose encoder carries its fixed normalisation in its weights."""
+        copy = MiniModel(MiniConfig(**{**asdict(self.settings), "folded": False}))
+        if self.settings.folded:
+            copy.encoder.fold()
+        copy.stabilizer = self.stabilizer
+        copy.load_state_dict(self.state_dict(), strict=True)
+        copy.encoder.fold()
+        copy.settings = MiniConfig(**{**asdict(self.settings), "folded": True})
+        return copy.train(self.training)
+
+    def network_size(self, image_size: tuple[int, int], num_tokens: int | None) -> tuple[int, int]:
+        """(H, W) that the network works at: the budget at the image's aspect, multiples of 32."""
+        height, width = image_size
+        budget = num_tokens or self.settings.num_tokens
+        factor = math.sqrt(budget * CELL * CELL / (height * width))
+        return (
+            max(1, round(height * factor / MULTIPLE)) * MULTIPLE,
+            max(1, round(width * factor / MULTIPLE)) * MULTIPLE,
+        )
+
+    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
+        """image: B x 3 x H x W float RGB in 0..1 -> Latent (features B x C x h/8 x w/8)."""
+        image_size = (image.shape[-2], image.shape[-1])
+        size = self.network_size(image_size, num_tokens)
+        return self.encode_at(image, size)
+
+    def encode_at(self, image: Tensor, size: tuple[int, int]) -> Latent:
+        """As encode, at a network size that the caller chose (multiples of 32)."""
+        image_size = (image.shape[-2], image.shape[-1])
+        if image_size != size:
+            image = F.interpolate(image, size, mode="bilinear", antialias=True)
+        image = (image - IMAGE_MEAN) / IMAGE_STD
+        features = self.neck(self.encoder(image.contiguous(memory_format=torch.channels_last)))
+        return Latent(features, image_size, size)
+
+    def decode_raw(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """Raw points B x 3 x h x w and mask B x h x w at the decoder's own resolution."""
+        height, width = latent.image_size
+        points, mask = self.decoder(latent.features, width / height)
+        return points, mask[:, 0]
+
+    def decode(self, latent: Latent) -> AffinePoints:
+        """Latent -> affine-invariant points at latent.image_size."""
+        points, mask = self.decode_raw(latent)
+        points = _resize(points, latent.image_size)
+        mask = _resize(mask[:, None], latent.image_size)[:, 0]
+        return AffinePoints(remap_exp(points), mask)
+
+
+def remap_exp(raw: Tensor) -> Tensor:
+    """Raw points B x 3 x h x w -> B x h x w x 3: z = exp(z_raw), xy = xy_raw z."""
+    z = raw[:, 2:].exp()
+    return torch.cat([raw[:, :2] * z, z], dim=1).permute(0, 2, 3, 1)
+
+
+def _resize(x: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
+    return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
+
+
+def _with_view_plane(x: Tensor, aspect: float) -> Tensor:
+    """x with two more channels: position on the view plane, its diagonal spanning -1 to 1."""
+    batch, _, height, width = x.shape
+    span_x = aspect / math.hypot(aspect, 1)
+    span_y = 1 / math.hypot(aspect, 1)
+    u = torch.linspace(-1 + 1 / width, 1 - 1 / width, width, dtype=x.dtype, device=x.device)
+    v = torch.linspace(-1 + 1 / height, 1 - 1 / height, height, dtype=x.dtype, device=x.device)
+    plane = torch.stack(torch.meshgrid(u * span_x, v * span_y, indexing="xy"))
+    return torch.cat([x, plane.expand(batch, -1, -1, -1)], dim=1)

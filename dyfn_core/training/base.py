@@ -1,0 +1,137 @@
+"""Training the small base model: encoder and head on single frames, MoGe's objective."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_shards
+from dyfn_core.losses.local import local_loss
+from dyfn_core.losses.mask import mask_loss
+from dyfn_core.losses.normal import normal_loss
+from dyfn_core.losses.target import target_from_depth
+from dyfn_core.losses.whole_frame import whole_frame_loss
+from dyfn_core.models.checkpoints import load_model
+from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
+from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
+from dyfn_core.training.trainer import Task, picture_rows
+from dyfn_core.training.validation import Example, recording_examples, score, shard_examples
+
+LOCAL_LEVELS = (1 / 4, 1 / 16)
+
+
+def clip_source(config: RunConfig, length: int, strides: tuple[int, int]) -> ClipSource:
+    """Where a run's training clips come from."""
+    return ClipSource(
+        roots=config.data,
+        kinds=config.kinds,
+        length=length,
+        strides=strides,
+        stages=tuple(SizeStage(s.from_step, s.sizes, s.batch) for s in config.stages),
+        augment_strength=config.augment_strength,
+        smallest_view=config.smallest_view,
+        seed=config.seed,
+    )
+
+
+class BaseTask(Task):
+    """The whole of `mini` on frames: whole-frame, local, normal and mask errors."""
+
+    model: MiniModel
+
+    def __init__(self, config: BaseRunConfig) -> None:
+        self.config = config
+        self.model = build_base(config).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.source = clip_source(config, 1, (1, 1))
+        self.examples: dict[str, list[Example]] = {}
+
+    def groups(self) -> list[dict[str, Any]]:
+        rate = self.config.learning_rate
+        encoder = [p for p in self.model.encoder.parameters() if p.requires_grad]
+        head = [*self.model.neck.parameters(), *self.model.decoder.parameters()]
+        return [
+            {"params": encoder, "lr": rate * self.config.encoder_rate},
+            {"params": head, "lr": rate},
+        ]
+
+    def batches(self, start: int) -> Iterator[ClipBatch]:
+        return batch_loader(self.source, start)
+
+    def loss(self, batch: ClipBatch) -> tuple[Tensor, dict[str, float]]:
+        raw, mask, aspect = self._forward(batch)
+        target = target_from_depth(batch.depth[:, 0], batch.intrinsics[:, 0], aspect)
+        points = remap_exp(raw)
+        frame, scale = whole_frame_loss(points, target)
+        local = [
+            local_loss(points, target, scale, alpha, balls)
+            for alpha, balls in zip(LOCAL_LEVELS, self.config.balls, strict=True)
+        ]
+        normal, masks = normal_loss(points, target), mask_loss(mask, target)
+        total = (
+            frame
+            + self.config.local_weight * torch.stack(local).sum()
+            + self.config.normal_weight * normal
+            + self.config.mask_weight * masks
+        )
+        names = ("loss", "frame", "local_4", "local_16", "normal", "mask")
+        terms = (total, frame, *local, normal, masks)
+        return total, {name: float(term.detach()) for name, term in zip(names, terms, strict=True)}
+
+    def _forward(self, batch: ClipBatch) -> tuple[Tensor, Tensor, float]:
+        image = batch.image[:, 0].float() / 255
+        size = (image.shape[-2], image.shape[-1])
+        raw, mask = self.model.decode_raw(self.model.encode_at(image, size))
+        return raw, mask, size[1] / size[0]
+
+    def validate(self) -> dict[str, float]:
+        """`score` is the error on held-out worlds, or on the training ones where none is held out."""
+        if not self.examples:
+            self.examples = validation_examples(self.config, self.source)
+        scores = {}
+        for name, examples in self.examples.items():
+            for metric, value in score(self.model, examples).items():
+                scores[f"{name}_{metric}"] = value
+        return {**scores, "score": scores["rendered_abs_rel"]}
+
+    def picture(self, batch: ClipBatch) -> np.ndarray:
+        raw, _, _ = self._forward(batch)
+        return picture_rows(batch, raw[:, 2].exp())
+
+    def export_model(self) -> MiniModel:
+        return self.model.folded()
+
+
+def build_base(config: BaseRunConfig) -> MiniModel:
+    """The model at step 0: ImageNet weights in the encoder, or a checkpoint."""
+    if config.initial is not None:
+        model = load_model(Path(config.initial))
+        if not isinstance(model, MiniModel):
+            raise ConfigError(f"initial: {config.initial} is no model of type 'mini'")
+    else:
+        try:
+            model = MiniModel(MiniConfig(**{**config.model, "folded": False}))
+        except TypeError as error:
+            raise ConfigError(f"model: {error}; the fields are those of MiniConfig") from error
+        model.load_imagenet_encoder()
+    model.encoder.frozen_blocks = config.frozen_blocks
+    frozen = [model.encoder.stem, *model.encoder.blocks[: config.frozen_blocks]]
+    for module in frozen if config.frozen_blocks else []:
+        module.requires_grad_(False)
+    return model.train()
+
+
+def validation_examples(config: RunConfig, source: ClipSource) -> dict[str, list[Example]]:
+    """Frames to validate on: "rendered", and "recorded" when the config names a recording."""
+    try:
+        shards = find_shards(source, "held_out")
+    except FileNotFoundError:
+        shards = find_shards(source, "train")
+    examples = {"rendered": shard_examples(shards, config.validation_frames)}
+    if config.validation_rgbd is not None:
+        examples["recorded"] = recording_examples(config.validation_rgbd)
+    return examples

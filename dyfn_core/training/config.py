@@ -1,0 +1,138 @@
+"""What a training run can be told, as YAML files and key=value overrides."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+Settings = TypeVar("Settings", bound="RunConfig")
+
+
+class ConfigError(ValueError):
+    """A training config that cannot be used; the message names file, key and expectation."""
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StageConfig(Strict):
+    """From step `from_step` on: batches of `batch` at one of `sizes` (H, W)."""
+
+    from_step: int = Field(ge=0)
+    sizes: tuple[tuple[int, int], ...] = Field(min_length=1)
+    batch: int = Field(ge=1)
+
+    @field_validator("sizes")
+    @classmethod
+    def _multiples(cls, sizes: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
+        for size in sizes:
+            if any(side <= 0 or side % 32 for side in size):
+                raise ValueError(f"size {size} must be positive multiples of 32")
+        return sizes
+
+
+class RunConfig(Strict):
+    """What every run has: data, schedule, bookkeeping.
+
+    data: roots of rendered folders. steps: length of the schedule. hours: the schedule ends no
+    later than after so much training time, whatever the step. validation_rgbd: a recording with
+    rgb/, depth/ and K.txt to validate on too.
+    """
+
+    data: tuple[Path, ...] = Field(min_length=1)
+    kinds: tuple[str, ...] = ("frames", "clip")
+    stages: tuple[StageConfig, ...] = Field(min_length=1)
+    steps: int = Field(ge=1)
+    hours: float | None = Field(None, gt=0)
+    seed: int = 0
+    threads: int = Field(2, ge=1)
+    learning_rate: float = Field(1e-3, gt=0)
+    weight_decay: float = Field(0.01, ge=0)
+    warmup_steps: int = Field(200, ge=0)
+    clip_norm: float = Field(1.0, gt=0)
+    ema_decay: float = Field(0.999, ge=0, lt=1)
+    most_bad_steps: int = Field(20, ge=0)
+    augment_strength: float = Field(1.0, ge=0, le=1)
+    smallest_view: float = Field(0.5, gt=0, le=1)
+    checkpoint_minutes: float = Field(4.0, gt=0)
+    log_every: int = Field(20, ge=1)
+    picture_every: int = Field(500, ge=1)
+    validate_every: int = Field(1000, ge=1)
+    validation_frames: int = Field(48, ge=1)
+    validation_rgbd: Path | None = None
+
+    @field_validator("stages")
+    @classmethod
+    def _in_order(cls, stages: tuple[StageConfig, ...]) -> tuple[StageConfig, ...]:
+        starts = [stage.from_step for stage in stages]
+        if starts[0] != 0 or starts != sorted(set(starts)):
+            raise ValueError(f"stages must start at step 0 and rise, got from_step {starts}")
+        return stages
+
+
+class BaseRunConfig(RunConfig):
+    """`dyfn-train base`: the small model's encoder and head.
+
+    encoder_rate: the encoder's learning rate relative to the head's. frozen_blocks: the stem and
+    so many encoder blocks keep their ImageNet weights. model: fields of MiniConfig. initial: a
+    checkpoint to start from instead of ImageNet weights.
+    """
+
+    model: dict[str, Any] = Field(default_factory=dict)
+    initial: Path | None = None
+    encoder_rate: float = Field(0.1, ge=0)
+    frozen_blocks: int = Field(3, ge=0, le=16)
+    local_weight: float = Field(1.0, ge=0)
+    normal_weight: float = Field(0.3, ge=0)
+    mask_weight: float = Field(1.0, ge=0)
+    balls: tuple[int, int] = (8, 12)
+
+
+def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Settings:
+    """The settings in a YAML file with `key=value` (or `key.sub=value`) overrides on top.
+
+    Relative paths in it are relative to the working directory. Raises ConfigError.
+    """
+    try:
+        values = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        raise ConfigError(f"no training config at {path}") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is no YAML: {error}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected a mapping of settings")
+    for override in overrides:
+        _override(values, override)
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        problems = "\n  ".join(_describe(problem, kind) for problem in error.errors())
+        raise ConfigError(f"{path}:\n  {problems}") from error
+
+
+def _override(values: dict[str, Any], override: str) -> None:
+    key, found, text = override.partition("=")
+    if not found or not key:
+        raise ConfigError(f"--set {override!r}: expected key=value")
+    *parents, last = key.split(".")
+    for parent in parents:
+        values = values.setdefault(parent, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"--set {override!r}: {parent} holds no settings of its own")
+    values[last] = yaml.safe_load(text)
+
+
+def _describe(problem: Any, kind: type[RunConfig]) -> str:
+    where = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(problem["loc"][-1]), kind.model_fields, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        return f"unknown key {where!r}{hint}"
+    if problem["type"] == "missing":
+        return f"key {where!r} is missing"
+    return f"{where}: {problem['msg']} (got {problem['input']!r})"

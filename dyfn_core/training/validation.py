@@ -1,0 +1,74 @@
+"""Quick scores during training: AbsRel and delta1 of single frames, aligned per frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from dyfn_core.data.rendered import Shard
+from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.models.base import GeometryModel
+
+SHORT_SIDE = 240  # frames are shrunk to this before they are encoded
+
+
+@dataclass(frozen=True)
+class Example:
+    """image H x W x 3 uint8 and true depth H x W metres, not finite or <= 0 where unknown."""
+
+    image: np.ndarray
+    depth: np.ndarray
+
+
+def shard_examples(shards: list[Shard], count: int) -> list[Example]:
+    """`count` frames, evenly spread over all the frames of the shards."""
+    places = [(shard, index) for shard in shards for index in range(len(shard))]
+    chosen = np.unique(np.linspace(0, len(places) - 1, min(count, len(places))).round().astype(int))
+    return [_small(*places[place][0].read(places[place][1])) for place in chosen]
+
+
+def recording_examples(folder: Path, every: int = 20) -> list[Example]:
+    """Every so-many-th frame of a folder with rgb/NNNNN.jpg and depth/NNNNN.png (millimetres).
+
+    Raises FileNotFoundError when it holds none.
+    """
+    examples = []
+    for path in sorted((folder / "rgb").glob("*.jpg"))[::every]:
+        image = cv2.imread(str(path))
+        depth = cv2.imread(str(folder / "depth" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
+        if image is None or depth is None:
+            raise FileNotFoundError(f"{path} or its depth image cannot be read")
+        examples.append(_small(image[..., ::-1], depth.astype(np.float32) / 1000))
+    if not examples:
+        raise FileNotFoundError(f"no rgb/*.jpg under {folder}")
+    return examples
+
+
+def _small(image: np.ndarray, depth: np.ndarray) -> Example:
+    factor = SHORT_SIDE / min(image.shape[:2])
+    if factor < 1:
+        size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+        image = cv2.resize(np.ascontiguousarray(image), size, interpolation=cv2.INTER_AREA)
+    size = (image.shape[1], image.shape[0])
+    return Example(image, cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
+
+
+def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
+    """Mean AbsRel and delta1 over the examples, image protocol (paper section 5)."""
+    errors, shares = [], []
+    for example in examples:
+        image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
+        depth = model.decode(model.encode(image.float() / 255)).points[0, ..., 2].numpy()
+        valid = np.isfinite(example.depth) & (example.depth > 1e-3)
+        if valid.sum() < 100:
+            continue
+        true, ours = example.depth[valid], depth[valid]
+        scale, shift = fit_scale_shift(ours[::4], true[::4], 1 / true[::4])
+        aligned = np.maximum(scale * ours + shift, 1e-3)
+        errors.append(np.mean(np.abs(aligned - true) / true))
+        shares.append(np.mean(np.maximum(aligned / true, true / aligned) < 1.25))
+    return {"abs_rel": float(np.mean(errors)), "delta1": float(np.mean(shares))}
