@@ -211,7 +211,9 @@ def image_to_batch(
     if isinstance(image, np.ndarray):
         if image.dtype != np.uint8 and not np.issubdtype(image.dtype, np.floating):
             raise TypeError(f"image dtype must be uint8 or float, got {image.dtype}")
-        image = torch.from_numpy(np.ascontiguousarray(image))
+        image = np.ascontiguousarray(image)
+        # torch warns about read-only arrays (a ROS message's bytes), which we never write to.
+        image = torch.from_numpy(image) if image.flags.writeable else torch.tensor(image)
     if not isinstance(image, Tensor):
         raise TypeError(f"image must be a numpy array or a torch tensor, got {type(image)}")
     shape = tuple(image.shape)

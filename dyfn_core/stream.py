@@ -1,0 +1,308 @@
+"""DepthStream: one camera over time, frame by frame, causally."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dyfn_core.geometry.camera import (
+    check_camera_matrix,
+    intrinsics_from_focal,
+    normalize_intrinsics,
+    sample,
+    sampled_uv,
+    solve_focal_shift,
+)
+from dyfn_core.models.base import (
+    AffinePoints,
+    GeometryModel,
+    assemble,
+    first_of_batch,
+    image_to_batch,
+)
+from dyfn_core.prediction import Prediction, StreamState
+
+logger = logging.getLogger(__name__)
+
+SHIFT_MODES = ("filtered", "held", "per_frame")
+REQUESTED = "requested"
+NEW_SIZE = "image size changed"
+NEW_CAMERA = "camera matrix changed"
+
+
+@dataclass(frozen=True)
+class Track:
+    """What a RobustMean remembers. spread: mean absolute innovation. count: measurements seen."""
+
+    value: float
+    spread: float = 0.0
+    count: int = 1
+
+
+@dataclass(frozen=True)
+class RobustMean:
+    """A recursive mean that settles, then follows slowly, and that one bad frame cannot move far.
+
+    gain: smallest weight of a new measurement; until 1/n falls below it this is the plain mean
+        of all measurements. 0 never follows.
+    clip: an innovation beyond clip times the usual one counts as just that much.
+    """
+
+    gain: float = 0.02
+    clip: float = 3.0
+
+    def update(self, track: Track | None, measured: float) -> Track:
+        """The track after one more measurement; None starts one."""
+        if track is None:
+            return Track(measured)
+        count = track.count + 1
+        weight = max(1 / count, self.gain)
+        innovation = measured - track.value
+        limit = self.clip * track.spread if count > 3 else math.inf
+        step = min(max(innovation, -limit), limit)
+        # The spread may grow faster than the value moves, so that a real change gets through.
+        spread = track.spread + weight * (min(abs(innovation), 2 * limit) - track.spread)
+        return Track(track.value + weight * step, spread, count)
+
+
+@dataclass(frozen=True)
+class StreamMemory:
+    """All that a stream remembers between two frames: plain values and tensors.
+
+    frames: since the last reset. image_size: (H, W). stamp: of the last frame, seconds.
+    state: DyFN's. focal: of log(focal / half the diagonal), for an unknown camera.
+    shift: of the z-shift, in the unit of the point map.
+    """
+
+    frames: int = 0
+    image_size: tuple[int, int] | None = None
+    stamp: float | None = None
+    state: StreamState | None = None
+    focal: Track | None = None
+    shift: Track | None = None
+
+
+class DepthStream:
+    """Frames of one camera in, geometry that keeps its scale out.
+
+    Causal and deterministic: a frame's output depends on the frames since the last reset only,
+    and the same frames after a reset give the same bytes.
+
+    A known camera matrix fixes the focal and the principal point. An unknown camera's focal is a
+    robust running mean. The shift is one number per stream as far as DyFN keeps the latent's
+    statistics in place, so it is averaged over time; without DyFN every frame has its own.
+
+    resets: how often the stream started anew, by reason.
+    """
+
+    def __init__(
+        self,
+        model: GeometryModel,
+        camera_matrix: np.ndarray | None = None,
+        *,
+        stabilize: bool = True,
+        num_tokens: int | None = None,
+        shift_mode: str | None = None,
+        shift_filter: RobustMean | None = None,
+        focal_filter: RobustMean | None = None,
+        force_projection: bool = True,
+    ) -> None:
+        """camera_matrix: 3 x 3 in pixels, None when unknown.
+
+        stabilize: False runs the base model on every frame by itself.
+        num_tokens: how finely to look; None for the model's default.
+        shift_mode: "filtered" (running mean), "held" (the first frame's), "per_frame";
+            None is "filtered" with DyFN and "per_frame" without.
+        force_projection: points are the depth unprojected with the intrinsics.
+        Raises ValueError for a bad camera matrix, shift_mode or num_tokens.
+        """
+        if shift_mode is not None and shift_mode not in SHIFT_MODES:
+            raise ValueError(f"shift_mode {shift_mode!r} is unknown, expected one of {SHIFT_MODES}")
+        if num_tokens is not None and num_tokens < 1:
+            raise ValueError(f"num_tokens must be at least 1, got {num_tokens}")
+        self.model = model
+        self.stabilize = stabilize and model.stabilizer is not None
+        self.num_tokens = num_tokens
+        self.shift_mode = shift_mode or ("filtered" if self.stabilize else "per_frame")
+        self.shift_filter = shift_filter or RobustMean()
+        self.focal_filter = focal_filter or RobustMean()
+        self.force_projection = force_projection
+        self.resets: Counter[str] = Counter()
+        self.memory = StreamMemory()
+        self._camera_matrix = None if camera_matrix is None else check_camera_matrix(camera_matrix)
+        self._camera_size: tuple[int, int] | None = None
+
+    @property
+    def camera_matrix(self) -> np.ndarray | None:
+        """3 x 3 float64, pixels; None when unknown. Setting another one resets the stream."""
+        return None if self._camera_matrix is None else self._camera_matrix.copy()
+
+    @camera_matrix.setter
+    def camera_matrix(self, camera_matrix: np.ndarray | None) -> None:
+        new = None if camera_matrix is None else check_camera_matrix(camera_matrix)
+        old = self._camera_matrix
+        if (new is None and old is None) or (
+            new is not None and old is not None and np.array_equal(new, old)
+        ):
+            return
+        self._camera_matrix, self._camera_size = new, None
+        if self.memory.frames:
+            self.reset(NEW_CAMERA)
+
+    def reset(self, reason: str = REQUESTED) -> None:
+        """Forget everything but the camera matrix; the next frame is a first frame."""
+        self.resets[reason] += 1
+        self.memory = StreamMemory()
+
+    def push(self, image: np.ndarray | Tensor, stamp: float | None = None) -> Prediction:
+        """The next frame -> its geometry.
+
+        image: H x W x 3 uint8 RGB, or float 3 x H x W in 0..1. stamp: seconds.
+        An image of another size starts the stream anew. Raises TypeError or ValueError, naming
+        what was wrong, for anything else; the stream is then as it was.
+        """
+        return push_together([self], [image], [stamp])[0]
+
+    def _check(self, image: np.ndarray | Tensor, stamp: float | None) -> Tensor:
+        """A frame -> 1 x 3 x H x W on the model's device; changes nothing."""
+        if stamp is not None and not math.isfinite(stamp):
+            raise ValueError(f"stamp must be a finite number of seconds, got {stamp}")
+        batch, single = image_to_batch(image, self.model.device)
+        if not single:
+            raise ValueError(f"push takes one image at a time, got a batch of {len(batch)}")
+        return batch
+
+    def _make_room(self, size: tuple[int, int]) -> None:
+        """Start anew if the image size changed; a camera matrix is for one size only."""
+        if self._camera_matrix is not None and self._camera_size not in (None, size):
+            logger.warning(
+                "the camera matrix is for images of %s, this one is %s: forgetting the matrix",
+                self._camera_size,
+                size,
+            )
+            self._camera_matrix = None
+        if self.memory.image_size not in (None, size):
+            self.reset(NEW_SIZE)
+        self._camera_size = size
+
+    def _finish(
+        self, affine: AffinePoints, state: StreamState | None, stamp: float | None
+    ) -> Prediction:
+        """Focal, shift and intrinsics of one frame's affine points (batch of one)."""
+        valid = affine.mask > self.model.mask_threshold
+        size = (valid.shape[-2], valid.shape[-1])
+        samples, usable = sample(affine.points, valid)
+        xyz, uv = samples[0][usable[0]], sampled_uv(*size)[usable[0]]
+        memory = replace(
+            self.memory,
+            frames=self.memory.frames + 1,
+            image_size=size,
+            stamp=stamp,
+            state=state,
+        )
+        if self._camera_matrix is not None:
+            known = normalize_intrinsics(self._camera_matrix, size)
+            intrinsics = torch.from_numpy(known)[None]
+        else:
+            memory = self._track_focal(memory, xyz, uv)
+            focal = 1.0 if memory.focal is None else math.exp(memory.focal.value)
+            intrinsics = intrinsics_from_focal(
+                torch.tensor([focal], dtype=torch.float64), size[1] / size[0]
+            )
+        memory, shift = self._track_shift(memory, xyz, uv, intrinsics[0].numpy(), size)
+        prediction = assemble(
+            affine,
+            valid,
+            affine.points.new_tensor([shift]),
+            intrinsics.to(affine.points),
+            state,
+            self.force_projection,
+        )
+        self.memory = memory
+        return first_of_batch(prediction)
+
+    def _track_focal(self, memory: StreamMemory, xyz: np.ndarray, uv: np.ndarray) -> StreamMemory:
+        found = solve_focal_shift(xyz, uv)
+        if not found.solved:
+            return memory
+        return replace(memory, focal=self.focal_filter.update(memory.focal, math.log(found.focal)))
+
+    def _track_shift(
+        self,
+        memory: StreamMemory,
+        xyz: np.ndarray,
+        uv: np.ndarray,
+        intrinsics: np.ndarray,
+        size: tuple[int, int],
+    ) -> tuple[StreamMemory, float]:
+        # Stretched by the focals, x and y project with focal 1 whatever the pixels' aspect. The
+        # network assumes a centred principal point, so its points are compared with centred rays.
+        half = math.hypot(*size) / 2
+        scale = [intrinsics[0, 0] * size[1] / half, intrinsics[1, 1] * size[0] / half, 1.0]
+        found = solve_focal_shift(xyz * scale, uv, focal=1.0)
+        if not found.solved:
+            return memory, 0.0 if memory.shift is None else memory.shift.value
+        if self.shift_mode == "per_frame":
+            return memory, found.shift
+        track = memory.shift
+        if track is None or self.shift_mode == "filtered":
+            track = self.shift_filter.update(track, found.shift)
+        # A shift from other frames must not put this one's near parts behind the camera.
+        floor = -0.98 * float(np.quantile(xyz[:, 2], 0.02))
+        return replace(memory, shift=track), max(track.value, floor)
+
+
+def push_together(
+    streams: Sequence[DepthStream],
+    images: Sequence[np.ndarray | Tensor],
+    stamps: Sequence[float | None] | None = None,
+) -> list[Prediction]:
+    """One frame of each stream in one batch; as push, but the network runs once.
+
+    Raises ValueError when the streams do not share model, num_tokens and stabilize, or the
+    images are not of one size; nothing has then been pushed.
+    """
+    stamps = [None] * len(streams) if stamps is None else stamps
+    first = streams[0]
+    for stream in streams:
+        if (stream.model, stream.num_tokens, stream.stabilize) != (
+            first.model,
+            first.num_tokens,
+            first.stabilize,
+        ):
+            raise ValueError("streams of one batch must share model, num_tokens and stabilize")
+    if len({id(stream) for stream in streams}) < len(streams):
+        raise ValueError("a stream cannot take two frames in one batch")
+    with torch.inference_mode():
+        frames = [
+            stream._check(image, stamp)
+            for stream, image, stamp in zip(streams, images, stamps, strict=True)
+        ]
+        if len({frame.shape for frame in frames}) > 1:
+            raise ValueError(
+                f"images of one batch must be of one size, got {[tuple(f.shape) for f in frames]}"
+            )
+        for stream in streams:
+            stream._make_room((frames[0].shape[-2], frames[0].shape[-1]))
+        state = StreamState.stack([stream.memory.state for stream in streams])
+        affine, state = first.model.predict_affine(
+            frames[0] if len(frames) == 1 else torch.cat(frames),
+            state,
+            first.num_tokens,
+            first.stabilize,
+        )
+        states: Sequence[StreamState | None]
+        states = [None] * len(streams) if state is None else state.unbind()
+        return [
+            stream._finish(
+                AffinePoints(affine.points[i : i + 1], affine.mask[i : i + 1]), states[i], stamps[i]
+            )
+            for i, stream in enumerate(streams)
+        ]
