@@ -11,6 +11,7 @@ import numpy as np
 from dyfn_ros.messages import valid_depth
 
 if TYPE_CHECKING:
+    from dyfn_core.models.base import GeometryModel
     from dyfn_core.prediction import Prediction
     from dyfn_core.stream import DepthStream
 
@@ -44,6 +45,22 @@ class Geometry:
 
 
 StreamMaker = Callable[[StreamKey], "DepthStream"]
+
+
+def stream_maker(model: GeometryModel) -> StreamMaker:
+    """The one way in which streams are made, live and offline."""
+    from dyfn_core.stream import DepthStream
+
+    def make(key: StreamKey) -> DepthStream:
+        matrix = key.camera_matrix
+        return DepthStream(
+            model,
+            camera_matrix=None if matrix is None else np.array(matrix).reshape(3, 3),
+            stabilize=key.stabilize,
+            num_tokens=key.num_tokens or None,
+        )
+
+    return make
 
 
 class CameraStream:

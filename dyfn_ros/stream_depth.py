@@ -27,7 +27,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_srvs.srv import Trigger
 
 from dyfn_ros import messages
-from dyfn_ros.camera_stream import CameraStream, Geometry, StreamKey
+from dyfn_ros.camera_stream import CameraStream, Geometry, stream_maker
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.messages import MessageError
 from dyfn_ros.parameters import NodeParameters, Settings
@@ -173,8 +173,6 @@ class StreamDepthNode(Node):
     def _load_model(self) -> None:
         import torch
 
-        from dyfn_core.stream import DepthStream
-
         settings = self.settings
         if settings.threads:
             torch.set_num_threads(settings.threads)
@@ -183,16 +181,7 @@ class StreamDepthNode(Node):
             device = "cuda" if torch.cuda.is_available() else "cpu"
         model = self._load(settings.model, device)
 
-        def make(key: StreamKey) -> DepthStream:
-            matrix = key.camera_matrix
-            return DepthStream(
-                model,
-                camera_matrix=None if matrix is None else np.array(matrix).reshape(3, 3),
-                stabilize=key.stabilize,
-                num_tokens=key.num_tokens or None,
-            )
-
-        self._camera = CameraStream(make)
+        self._camera = CameraStream(stream_maker(model))
         self.get_logger().info(
             f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
         )

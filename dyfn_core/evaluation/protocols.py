@@ -158,6 +158,24 @@ def sample_grid(shape: tuple[int, ...], samples: int) -> tuple[slice, slice]:
     return slice(step // 2, None, step), slice(step // 2, None, step)
 
 
+def to_shape(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Nearest samples of an H x W array at another resolution of the same field of view.
+
+    Raises ValueError when the aspect ratios differ by more than 2%.
+    """
+    if image.shape == shape:
+        return image
+    (height, width), (rows, columns) = image.shape, shape
+    if abs(width * rows / (height * columns) - 1) > 0.02:
+        raise ValueError(
+            f"ground truth of {columns} x {rows} pixels does not show the same field of view as "
+            f"images of {width} x {height}"
+        )
+    row = (np.arange(rows) * 2 + 1) * height // (2 * rows)
+    column = (np.arange(columns) * 2 + 1) * width // (2 * columns)
+    return image[row[:, None], column]
+
+
 def ramp(shape: tuple[int, int]) -> np.ndarray:
     """Control: a vertical ramp from 2 (top) to 1 (bottom); what needs no network at all."""
     height, width = shape

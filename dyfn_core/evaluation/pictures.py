@@ -1,0 +1,175 @@
+"""Pictures of depth for people: coloured depth, error maps, strips of frames, curves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+INVALID = (70, 70, 70)
+MAX_ERROR = 0.5  # relative error that the error map saturates at
+CAPTION_HEIGHT = 22
+
+
+def colour_depth(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """H x W depth -> H x W x 3 uint8 RGB: near is red, far is blue, in log depth; invalid grey.
+
+    near, far: ends of the colour scale, in the unit of depth, 0 < near < far.
+    """
+    valid = np.isfinite(depth) & (depth > 0)
+    log_depth = np.log(np.where(valid, depth, near))
+    nearness = (np.log(far) - log_depth) / (np.log(far) - np.log(near))
+    return _paint("turbo", nearness * 0.92 + 0.04, valid)
+
+
+def colour_error(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """|d - p| / d as H x W x 3 uint8 RGB: black is right, yellow is MAX_ERROR and more."""
+    valid = np.isfinite(prediction) & np.isfinite(target) & (prediction > 0) & (target > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        error = np.abs(prediction - target) / target
+    return _paint("inferno", np.where(valid, error, 0) / MAX_ERROR, valid)
+
+
+def _paint(name: str, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    table = (colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
+    painted = table[np.clip(values * 255, 0, 255).astype(np.uint8)]
+    painted[~valid] = INVALID
+    return painted
+
+
+def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+    """2nd and 98th percentile over the valid pixels of all depths, at least 5% apart."""
+    values = [d[np.isfinite(d) & (d > 0)] for d in depths]
+    joined = np.concatenate([v for v in values if v.size] or [np.ones(1)])
+    near, far = np.percentile(joined, [2, 98])
+    return float(near), float(max(far, near * 1.05))
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A frame kept for the strip, already small.
+
+    image: h x w x 3 uint8 RGB. depth: h x w, NaN where the prediction is invalid.
+    truth: h x w metres, NaN invalid; None without ground truth.
+    """
+
+    index: int
+    image: np.ndarray
+    depth: np.ndarray
+    truth: np.ndarray | None
+
+
+class FrameStrip:
+    """Keeps a few evenly spaced frames of a sequence and draws them side by side."""
+
+    def __init__(self, expected_frames: int, count: int = 6, width: int = 240) -> None:
+        last = max(expected_frames - 1, 0)
+        self.wanted = {round(i) for i in np.linspace(0, last, min(count, last + 1))}
+        self.width = width
+        self.snapshots: list[Snapshot] = []
+
+    def add(
+        self, index: int, image: np.ndarray, depth: np.ndarray, truth: np.ndarray | None
+    ) -> None:
+        """Keep the frame if it is one of the wanted ones; arrays as in Snapshot, any size."""
+        if index not in self.wanted:
+            return
+        height = max(1, round(image.shape[0] * self.width / image.shape[1]))
+        size = (self.width, height)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        rest = [
+            None if a is None else cv2.resize(a, size, interpolation=cv2.INTER_NEAREST)
+            for a in (depth.astype(np.float32), truth)
+        ]
+        assert rest[0] is not None
+        self.snapshots.append(Snapshot(index, small, rest[0], rest[1]))
+
+    def draw(self, scale: float = 1.0, shift: float = 0.0) -> np.ndarray:
+        """One row a frame: input, ground truth, depth, error (the middle and last need truth).
+
+        scale, shift: one alignment for all frames (the video protocol's), so that drift shows.
+        Returns H x W x 3 uint8 RGB. Raises ValueError when no frame was kept.
+        """
+        if not self.snapshots:
+            raise ValueError("no frame was kept for the strip")
+        truths = [s.truth for s in self.snapshots if s.truth is not None]
+        aligned = [scale * s.depth + shift for s in self.snapshots]
+        near, far = depth_range(truths or aligned)
+        rows = [
+            self._row(s, depth, near, far, bool(truths))
+            for s, depth in zip(self.snapshots, aligned, strict=True)
+        ]
+        names = ["input", "ground truth", "depth", "error"] if truths else ["input", "depth"]
+        unit = f"{near:.1f} to {far:.1f} m" if truths else "up to scale"
+        return np.vstack([_captions(names, self.width, unit), *rows])
+
+    def _row(
+        self, snapshot: Snapshot, depth: np.ndarray, near: float, far: float, with_truth: bool
+    ) -> np.ndarray:
+        image = snapshot.image.copy()
+        _write(image, f"{snapshot.index}", (4, image.shape[0] - 6))
+        cells = [image, colour_depth(depth, near, far)]
+        if with_truth:
+            truth = np.full(depth.shape, np.nan) if snapshot.truth is None else snapshot.truth
+            cells.insert(1, colour_depth(truth, near, far))
+            cells.append(colour_error(depth, truth))
+        return np.hstack([np.pad(c, ((1, 1), (1, 1), (0, 0))) for c in cells])
+
+
+def _captions(names: list[str], width: int, unit: str) -> np.ndarray:
+    bar = np.full((CAPTION_HEIGHT, (width + 2) * len(names), 3), 255, np.uint8)
+    for column, name in enumerate(names):
+        text = f"error, 0 to {MAX_ERROR:.0%}" if name == "error" else name
+        text = f"depth, {unit}" if name == "depth" else text
+        cv2.putText(
+            bar,
+            text,
+            (column * (width + 2) + 4, 16),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.45,
+            0,
+            1,
+            cv2.LINE_AA,
+        )
+    return bar
+
+
+def _write(image: np.ndarray, text: str, corner: tuple[int, int]) -> None:
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(
+            image, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA
+        )
+
+
+def curves(
+    panels: Mapping[str, Mapping[str, Sequence[float | None]]], x_label: str = "frame"
+) -> np.ndarray:
+    """Panels (title -> line name -> a value per frame, None for a gap) as one RGB picture."""
+    figure = Figure(figsize=(8.4, 2.3 * len(panels)), dpi=100, layout="constrained")
+    axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
+    for axis, (title, lines) in zip(axes, panels.items(), strict=True):
+        for name, values in lines.items():
+            axis.plot([np.nan if v is None else v for v in values], label=name, linewidth=1.3)
+        axis.set_title(title, fontsize=10, loc="left")
+        axis.grid(alpha=0.3)
+        axis.tick_params(labelsize=8)
+        if len(lines) > 1:
+            axis.legend(fontsize=8, frameon=False)
+    axes[-1].set_xlabel(x_label, fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def encode_picture(image: np.ndarray, suffix: str = ".png", quality: int = 88) -> bytes:
+    """H x W x 3 uint8 RGB -> the bytes of a .png or .jpg file."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix == ".jpg" else []
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(image[..., ::-1]), options)
+    if not done:
+        raise ValueError(f"cannot encode a picture of shape {image.shape} as {suffix}")
+    return data.tobytes()

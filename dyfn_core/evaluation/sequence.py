@@ -1,0 +1,199 @@
+"""A whole sequence evaluated: scores, controls, latency, rows, and the pictures of it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dyfn_core.evaluation.pictures import FrameStrip, curves
+from dyfn_core.evaluation.protocols import (
+    ControlledScorer,
+    FrameScore,
+    SequenceScore,
+    SequenceScorer,
+    spread,
+    to_shape,
+)
+from dyfn_core.evaluation.report import Cell, Table
+
+COLUMNS = (
+    "frame",
+    "stamp",
+    "latency_ms",
+    "coverage",
+    "pixels",
+    "image_abs_rel",
+    "image_delta1",
+    "video_abs_rel",
+    "video_delta1",
+    "scale",
+    "shift",
+)
+
+
+class SequenceEvaluation:
+    """Takes frames one at a time and says at the end how good they were.
+
+    expected_frames: how many there will be, for the choice of the strip's frames.
+    depth_max: cap of the ground truth in metres.
+    """
+
+    def __init__(self, expected_frames: int, depth_max: float = float("inf")) -> None:
+        self.scores = ControlledScorer(depth_max)
+        self.strip = FrameStrip(expected_frames)
+        self._stamps: list[float] = []
+        self._latencies: list[float] = []
+        self._hash = hashlib.sha256()
+
+    def push(
+        self,
+        image: np.ndarray,
+        depth: np.ndarray,
+        valid: np.ndarray,
+        truth: np.ndarray | None,
+        *,
+        stamp: float,
+        latency: float,
+    ) -> FrameScore:
+        """One frame.
+
+        image: H x W x 3 uint8 RGB. depth: H x W up to scale; valid: H x W bool.
+        truth: metres, NaN invalid, of the same field of view (any size); None when unknown.
+        stamp, latency: seconds. Raises ValueError when truth has another aspect ratio.
+        """
+        masked = np.where(valid, depth, np.nan).astype(np.float32)
+        self._hash.update(masked.tobytes())
+        self.strip.add(len(self._stamps), image, masked, truth)
+        self._stamps.append(stamp)
+        self._latencies.append(latency)
+        if truth is None:
+            truth = np.full((1, 1), np.nan, np.float32)
+            masked = truth
+        return self.scores.push(to_shape(masked, truth.shape), truth)
+
+    @property
+    def frames(self) -> int:
+        """Frames pushed so far."""
+        return len(self._stamps)
+
+    @property
+    def output_hash(self) -> str:
+        """SHA-256 over the depth of every frame: float32, row-major, NaN where invalid."""
+        return self._hash.hexdigest()
+
+    def latency_ms(self) -> dict[str, float] | None:
+        """Median and 99th percentile of the latency; None without frames."""
+        if not self._latencies:
+            return None
+        p50, p99 = np.percentile(np.array(self._latencies) * 1000, [50, 99])
+        return {"p50": float(p50), "p99": float(p99)}
+
+    def results(self) -> dict[str, Any]:
+        """What goes into metrics.json: protocols (None without truth), controls, spread."""
+        scorer = self.scores.scorer
+        video = scorer.video()
+        return {
+            "frames": self.frames,
+            "image": _means(scorer.image()),
+            "video": _means(video),
+            "latency_ms": self.latency_ms(),
+            "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
+            "coverage": _coverage(scorer),
+            "spread": spread(scorer.frames),
+            "controls": {
+                name: {"image": _means(control.image()), "video": _means(control.video())}
+                for name, control in self.scores.controls.items()
+            },
+            "output_sha256": self.output_hash,
+        }
+
+    def rows(self) -> list[dict[str, Cell]]:
+        """One dict of COLUMNS per frame; None where there is no truth."""
+        scorer = self.scores.scorer
+        video = scorer.video()
+        aligned = [None] * self.frames if video is None else video.frames
+        found = []
+        for index, frame in enumerate(scorer.frames):
+            image, other = frame.metrics or {}, aligned[index] or {}
+            values: tuple[Cell, ...] = (
+                index,
+                self._stamps[index],
+                self._latencies[index] * 1000,
+                frame.coverage,
+                frame.pixels,
+                image.get("abs_rel"),
+                image.get("delta1"),
+                other.get("abs_rel"),
+                other.get("delta1"),
+                frame.scale,
+                frame.shift,
+            )
+            found.append(dict(zip(COLUMNS, values, strict=True)))
+        return found
+
+    def draw_strip(self) -> np.ndarray:
+        """The strip, aligned as the video protocol does (H x W x 3 uint8 RGB)."""
+        video = self.scores.scorer.video()
+        return self.strip.draw(1, 0) if video is None else self.strip.draw(video.scale, video.shift)
+
+
+def _means(score: SequenceScore | None) -> dict[str, float] | None:
+    return None if score is None else score.metrics
+
+
+def _coverage(scorer: SequenceScorer) -> float | None:
+    scored = [f.coverage for f in scorer.frames if f.metrics is not None]
+    return float(np.mean(scored)) if scored else None
+
+
+def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
+    """Runs (name -> results()) and, below, the controls of the first, as one table."""
+    header = ("", "image AbsRel", "delta1", "video AbsRel", "delta1", "scale spread", "p50 ms")
+    rows: list[list[Cell]] = []
+    for name, result in results.items():
+        wandering = (result["spread"] or {}).get("log_scale_std")
+        latency = result["latency_ms"] or {}
+        p50 = latency.get("p50")
+        rows.append([name, *_scores(result), wandering, None if p50 is None else round(p50, 1)])
+    for name, control in next(iter(results.values()))["controls"].items():
+        rows.append([f"control: {name}", *_scores(control), None, None])
+    for row in rows:
+        row[-1] = None if row[-1] is None else f"{row[-1]:.1f}"
+    return Table(header, rows)
+
+
+def _scores(result: Mapping[str, dict[str, float] | None]) -> list[Cell]:
+    image, video = result["image"] or {}, result["video"] or {}
+    return [scores.get(name) for scores in (image, video) for name in ("abs_rel", "delta1")]
+
+
+def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:
+    """Per-frame scale (over its median) and error over time, a line per run."""
+    rows = {name: run.rows() for name, run in runs.items()}
+    medians = {
+        name: float(np.median([r["scale"] for r in found if r["scale"] is not None] or [1.0]))
+        for name, found in rows.items()
+    }
+    return curves(
+        {
+            "scale that fits each frame, over its median (flat is stable)": {
+                name: [_ratio(r["scale"], medians[name]) for r in found]
+                for name, found in rows.items()
+            },
+            "AbsRel, one alignment for the sequence (video protocol)": {
+                name: [_number(r["video_abs_rel"]) for r in found] for name, found in rows.items()
+            },
+        }
+    )
+
+
+def _number(cell: Cell) -> float | None:
+    return float(cell) if isinstance(cell, (int, float)) else None
+
+
+def _ratio(cell: Cell, by: float) -> float | None:
+    value = _number(cell)
+    return None if value is None or by == 0 else value / by

@@ -1,0 +1,91 @@
+"""What a replay leaves as a recording: input, depth, camera info and cloud, for Foxglove."""
+
+from __future__ import annotations
+
+import math
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from dyfn_ros.camera_stream import Geometry
+from dyfn_ros.messages import CLOUD_OFFSETS, CLOUD_STEP, depth_fields, pack_cloud
+from dyfn_ros.recording_writer import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    POINT_CLOUD,
+    TYPES,
+    RecordingWriter,
+    camera_info,
+    header,
+)
+from dyfn_ros.recordings import RecordedFrame
+
+MAX_POINTS = 20_000
+_FLOAT32 = 7  # sensor_msgs/PointField
+
+
+class ReplayRecording:
+    """Writes the frames of a replay on the node's topics, with the input's stamps.
+
+    Topics: the input image as JPEG (or as recorded when it was compressed),
+    /stream_depth/depth/image (32FC1), /stream_depth/depth/camera_info and
+    /stream_depth/points (organised, every s-th row and column, at most MAX_POINTS).
+    """
+
+    def __init__(self, path: Any) -> None:
+        self._writer = RecordingWriter(path, overwrite=True)
+
+    def __enter__(self) -> ReplayRecording:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def write(self, frame: RecordedFrame, geometry: Geometry) -> None:
+        """Everything of one frame."""
+        self._write_input(frame)
+        head = header(frame.stamp_ns, frame.frame_id)
+        image = TYPES.types[IMAGE](header=head, **depth_fields(geometry.depth, geometry.valid))
+        self._writer.write("/stream_depth/depth/image", IMAGE, image, frame.stamp_ns)
+        topic, size = "/stream_depth/depth/camera_info", geometry.depth.shape
+        info = camera_info(geometry.camera_matrix, size, frame.stamp_ns, frame.frame_id)
+        self._writer.write(topic, CAMERA_INFO, info, frame.stamp_ns)
+        cloud = cloud_message(frame, geometry)
+        self._writer.write("/stream_depth/points", POINT_CLOUD, cloud, frame.stamp_ns)
+
+    def _write_input(self, frame: RecordedFrame) -> None:
+        source = frame.source
+        if source.kind == COMPRESSED_IMAGE:
+            self._writer.write_cdr(source.topic, source.kind, source.data, frame.stamp_ns)
+            return
+        topic = f"{source.topic}/compressed"
+        self._writer.write_jpeg(topic, frame.image, frame.stamp_ns, frame.frame_id)
+
+
+def cloud_message(frame: RecordedFrame, geometry: Geometry) -> Any:
+    """A PointCloud2 of every s-th point, s the smallest that gives at most MAX_POINTS."""
+    step = max(1, math.ceil(math.sqrt(geometry.depth.size / MAX_POINTS)))
+    grid = (slice(step // 2, None, step),) * 2
+    cloud = pack_cloud(geometry.points[grid], geometry.valid[grid], frame.image[grid])
+    field = TYPES.types["sensor_msgs/msg/PointField"]
+    return TYPES.types[POINT_CLOUD](
+        header=header(frame.stamp_ns, frame.frame_id),
+        height=cloud.shape[0],
+        width=cloud.shape[1],
+        fields=[
+            field(name=name, offset=offset, datatype=_FLOAT32, count=1)
+            for name, offset in CLOUD_OFFSETS.items()
+        ],
+        is_bigendian=False,
+        point_step=CLOUD_STEP,
+        row_step=CLOUD_STEP * cloud.shape[1],
+        data=np.ascontiguousarray(cloud).reshape(-1).view(np.uint8),
+        is_dense=False,
+    )
