@@ -96,8 +96,8 @@ class Block(nn.Module):
         self.has_skip = stride == 1 and cin == cout
 
     def forward(self, x: Tensor) -> Tensor:
-        out = x if self.expand is None else F.relu6(self.expand(x))
-        out = self.project(F.relu6(self.depthwise(out)))
+        out = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
+        out = self.project(F.relu6(self.depthwise(out), inplace=True))
         return x + out if self.has_skip else out
 
 
@@ -129,7 +129,7 @@ class EfficientNetLite0(nn.Module):
         """image: B x 3 x H x W, normalised, H and W multiples of 32 -> features B x C_i x H/s x W/s, s = 8, 16, 32."""
         tracked = torch.is_grad_enabled()
         with torch.set_grad_enabled(tracked and self.frozen_blocks == 0):
-            x = F.relu6(self.stem(image))
+            x = F.relu6(self.stem(image), inplace=True)
         features = []
         for index, block in enumerate(self.blocks):
             with torch.set_grad_enabled(tracked and index >= self.frozen_blocks):

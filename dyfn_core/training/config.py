@@ -79,7 +79,8 @@ class BaseRunConfig(RunConfig):
     """`dyfn-train base`: the small model's encoder and head.
 
     encoder_rate: the encoder's learning rate relative to the head's. frozen_blocks: the stem and
-    so many encoder blocks keep their ImageNet weights. model: fields of MiniConfig. initial: a
+    so many encoder blocks keep their ImageNet weights. frozen_depthwise: so do all the encoder's
+    depthwise filters. model: fields of MiniConfig. initial: a
     checkpoint to start from instead of ImageNet weights.
     """
 
@@ -87,6 +88,7 @@ class BaseRunConfig(RunConfig):
     initial: Path | None = None
     encoder_rate: float = Field(0.1, ge=0)
     frozen_blocks: int = Field(3, ge=0, le=16)
+    frozen_depthwise: bool = True
     local_weight: float = Field(1.0, ge=0)
     normal_weight: float = Field(0.3, ge=0)
     mask_weight: float = Field(1.0, ge=0)

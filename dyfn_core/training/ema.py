@@ -43,9 +43,13 @@ class Ema:
         return {"updates": self.updates, "averages": self.averages}
 
     def load_state_dict(self, state: dict[str, object]) -> None:
+        """Take over the averages of parameters that are still trained.
+
+        A parameter that this run trains and the saved one did not starts from its present value.
+        """
         averages = state["averages"]
-        if not isinstance(averages, dict) or set(averages) != set(self.averages):
-            raise ValueError("the checkpoint averages other parameters than this run trains")
+        if not isinstance(averages, dict):
+            raise ValueError("the checkpoint holds no averaged parameters")
         self.updates = int(str(state["updates"]))
-        for name, value in averages.items():
-            self.averages[name].copy_(value)
+        for name, own in self.averages.items():
+            own.copy_(averages.get(name, self.parameters[name].detach()))

@@ -193,7 +193,7 @@ class Trainer:
             "seconds": self.seconds,
             "best": self.best,
             "model": self.task.model.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": self._moments(),
             "ema": self.ema.state_dict(),
             "config": self.config.model_dump(mode="json"),
             "torch_rng": torch.get_rng_state(),
@@ -206,6 +206,20 @@ class Trainer:
         with self.ema.applied():
             self._export(self.out / MODEL_FILE)
 
+    def _moments(self) -> dict[str, dict[str, Tensor]]:
+        """AdamW's state by parameter name, so that a resumed run may freeze other parts."""
+        return {
+            name: dict(self.optimizer.state[parameter])
+            for name, parameter in self.task.model.named_parameters()
+            if parameter in self.optimizer.state
+        }
+
+    def _restore_moments(self, moments: dict[str, dict[str, Tensor]]) -> None:
+        trained = {id(parameter) for parameter in self.trained}
+        for name, parameter in self.task.model.named_parameters():
+            if name in moments and id(parameter) in trained:
+                self.optimizer.state[parameter] = dict(moments[name])
+
     def _export(self, path: Path) -> None:
         notes = {"trained_steps": str(self.step), "trained_seconds": f"{self.seconds:.0f}"}
         save_model(self.task.export_model(), path, notes=notes)
@@ -215,7 +229,7 @@ class Trainer:
             raise TrainingError(f"nothing to resume: no {path}")
         state = torch.load(path, map_location="cpu", weights_only=True)
         self.task.model.load_state_dict(state["model"], strict=True)
-        self.optimizer.load_state_dict(state["optimizer"])
+        self._restore_moments(state["optimizer"])
         self.ema.load_state_dict(state["ema"])
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self.best = float(state["best"])
