@@ -1,0 +1,240 @@
+"""dyfn-replay: what it writes is right, complete and the same each time."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+from tiny_model import load_tiny
+
+from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_ros.messages import cloud_points, decode_depth
+from dyfn_ros.recording_writer import TYPES, RecordingWriter, RgbdFrame, write_rgbd_recording
+from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
+
+SIZE = (36, 48)
+CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
+
+
+def rgbd(count: int, truth: bool = True) -> list[RgbdFrame]:
+    rng = np.random.default_rng(3)
+    made = []
+    for index in range(count):
+        image = cv2.resize(rng.integers(0, 255, (5, 6, 3), np.uint8), SIZE[::-1])
+        depth = cv2.resize(rng.uniform(1, 4, (4, 5)), SIZE[::-1])
+        depth[:3] = 0
+        made.append(RgbdFrame(image, depth if truth else None, CAMERA, None, 50 + index / 15))
+    return made
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "walk"
+    write_rgbd_recording(path, rgbd(5), jpeg_quality=None, depth_encoding="32FC1")
+    return path
+
+
+def run(recording: Path, out: Path, *options: str) -> int:
+    return main([str(recording), "--out", str(out), "--model", "tiny", *options], load_tiny)
+
+
+def metrics(out: Path) -> dict[str, Any]:
+    return json.loads((out / "metrics.json").read_text())
+
+
+def output(out: Path) -> dict[str, list]:
+    read: dict[str, list] = {}
+    with Reader(out / "output.mcap") as reader:
+        for connection, _, data in reader.messages():
+            message = TYPES.deserialize_cdr(data, connection.msgtype)
+            read.setdefault(connection.topic, []).append(message)
+    return read
+
+
+def test_it_writes_everything(recording: Path, tmp_path: Path) -> None:
+    assert run(recording, tmp_path / "out") == ALL
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "frames.csv",
+        "metrics.json",
+        "output.mcap",
+        "report.html",
+        "strip.png",
+    ]
+    found = metrics(tmp_path / "out")
+    assert (found["frames"], found["model"], found["stabilizer"]) == (5, "tiny", True)
+    assert found["image"]["abs_rel"] <= found["video"]["abs_rel"] + 1e-9
+    assert 0 < found["image"]["delta1"] <= 1
+    assert 0 < found["latency_ms"]["p50"] <= found["latency_ms"]["p99"]
+    assert set(found["controls"]) == {"ramp", "constant"}
+    with (tmp_path / "out" / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == ["0", "1", "2", "3", "4"]
+    assert float(rows[3]["stamp"]) == pytest.approx(50.2)
+    mean = np.mean([float(row["video_abs_rel"]) for row in rows])
+    assert mean == pytest.approx(found["video"]["abs_rel"])
+    strip = cv2.imread(str(tmp_path / "out" / "strip.png"))
+    assert strip.shape[1] > 4 * 200 and strip.std() > 20
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("data:image/") == 2
+    assert "http" not in page
+    assert "tiny with DyFN" in page
+
+
+def test_scores_are_those_of_the_depth_in_the_output(recording: Path, tmp_path: Path) -> None:
+    run(recording, tmp_path / "out")
+    errors, predictions, truths = [], [], []
+    for message, frame in zip(
+        output(tmp_path / "out")["/stream_depth/depth/image"], rgbd(5), strict=True
+    ):
+        depth, truth = decode_depth(message), np.asarray(frame.depth_m, np.float32)
+        valid = np.isfinite(depth) & (truth > 0)
+        p, d = depth[valid], truth[valid]
+        scale, shift = fit_scale_shift(p, d, 1 / d)
+        errors.append(np.mean(np.abs(np.maximum(scale * p + shift, 1e-3) - d) / d))
+        predictions.append(p)
+        truths.append(d)
+    assert metrics(tmp_path / "out")["image"]["abs_rel"] == pytest.approx(np.mean(errors), rel=1e-4)
+    d = np.concatenate(truths)
+    scale, shift = fit_scale_shift(np.concatenate(predictions), d, 1 / d)
+    alignment = metrics(tmp_path / "out")["alignment"]
+    assert alignment == pytest.approx({"scale": scale, "shift": shift}, rel=1e-3)
+
+
+def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: Path) -> None:
+    run(recording, tmp_path / "out")
+    read = output(tmp_path / "out")
+    assert {topic: len(found) for topic, found in read.items()} == {
+        "/camera/image/compressed": 5,
+        "/stream_depth/depth/image": 5,
+        "/stream_depth/depth/camera_info": 5,
+        "/stream_depth/points": 5,
+    }
+    depth = read["/stream_depth/depth/image"][2]
+    assert (depth.encoding, depth.header.frame_id) == ("32FC1", "camera_optical")
+    assert not (depth.data.view(np.float32) == 0).any()
+    cloud = cloud_points(read["/stream_depth/points"][2])
+    valid = np.isfinite(cloud["z"])
+    np.testing.assert_array_equal(cloud["z"][valid], decode_depth(depth)[valid])
+    v, u = np.nonzero(valid)
+    found = cloud[valid]
+    np.testing.assert_allclose(found["x"] / found["z"] * 40 + 23.5, u, atol=1e-3)
+    np.testing.assert_allclose(found["y"] / found["z"] * 40 + 17.5, v, atol=1e-3)
+    with (tmp_path / "out" / "output.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and summary.statistics is not None
+    assert summary.statistics.message_count == 20
+    assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+
+
+def test_the_same_recording_gives_the_same_hash_whatever_the_storage(tmp_path: Path) -> None:
+    hashes = []
+    for name in ("a", "a", "b.mcap", "c.db3"):
+        if not (tmp_path / name).exists():
+            write_rgbd_recording(tmp_path / name, rgbd(3))
+        run(tmp_path / name, tmp_path / "out", "--no-output-recording")
+        hashes.append(metrics(tmp_path / "out")["output_sha256"])
+    assert len(set(hashes)) == 1
+    run(tmp_path / "a", tmp_path / "out", "--no-stabilizer", "--no-output-recording")
+    assert metrics(tmp_path / "out")["output_sha256"] != hashes[0]
+    assert metrics(tmp_path / "out")["stabilizer"] is False
+
+
+def test_without_truth_there_are_no_scores(tmp_path: Path) -> None:
+    write_rgbd_recording(tmp_path / "walk", rgbd(3, truth=False))
+    assert run(tmp_path / "walk", tmp_path / "out") == ALL
+    found = metrics(tmp_path / "out")
+    assert found["image"] is None and found["video"] is None and found["spread"] is None
+    assert found["latency_ms"]["p50"] > 0
+    assert (tmp_path / "out" / "strip.png").exists()
+
+
+def test_depth_topic_none_turns_the_scores_off(recording: Path, tmp_path: Path) -> None:
+    assert run(recording, tmp_path / "out", "--depth-topic", "none") == ALL
+    assert metrics(tmp_path / "out")["image"] is None
+
+
+def test_frames_can_be_limited_and_thinned(recording: Path, tmp_path: Path) -> None:
+    run(recording, tmp_path / "out", "--max-frames", "2", "--stride", "2")
+    with (tmp_path / "out" / "frames.csv").open() as file:
+        stamps = [float(row["stamp"]) for row in csv.DictReader(file)]
+    assert stamps == pytest.approx([50, 50 + 2 / 15])
+
+
+def test_truth_of_another_resolution_is_compared_at_its_pixels(tmp_path: Path) -> None:
+    half = [
+        RgbdFrame(f.image, f.depth_m[1::2, 1::2], CAMERA, None, f.stamp)  # type: ignore[index]
+        for f in rgbd(3)
+    ]
+    write_rgbd_recording(tmp_path / "walk", half)
+    assert run(tmp_path / "walk", tmp_path / "out") == ALL
+    write_rgbd_recording(tmp_path / "full", rgbd(3))
+    run(tmp_path / "full", tmp_path / "other")
+    ours, full = metrics(tmp_path / "out"), metrics(tmp_path / "other")
+    assert ours["image"]["abs_rel"] == pytest.approx(full["image"]["abs_rel"], rel=0.1)
+
+
+def test_truth_of_another_field_of_view_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = [RgbdFrame(f.image, f.depth_m[:, :20], CAMERA, None, f.stamp) for f in rgbd(2)]  # type: ignore[index]
+    write_rgbd_recording(tmp_path / "walk", cut)
+    assert run(tmp_path / "walk", tmp_path / "out") == UNUSABLE
+    assert "/camera/depth/image/compressed: ground truth of 20 x 36" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "metrics.json").exists()
+    assert not (tmp_path / "out" / "output.mcap").exists()
+
+
+def test_a_damaged_recording_is_used_as_far_as_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "walk.mcap"
+    rng = np.random.default_rng(0)
+    with RecordingWriter(path) as writer:
+        for index in range(40):
+            image = rng.integers(0, 255, (120, 160, 3), np.uint8)
+            writer.write_image("/image", image, index, "camera")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
+    assert run(path, tmp_path / "out", "--no-output-recording") == PARTIAL
+    found = metrics(tmp_path / "out")
+    assert 0 < found["frames"] < 40
+    assert len(found["recording"]["losses"]) == 1
+    assert "loss:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--image-topic", "/nope"], "no topic /nope"),
+        (["--depth-topic", "/camera/camera_info"], "is sensor_msgs/msg/CameraInfo"),
+        (["--model", "huge"], "model 'huge' is unknown"),
+    ],
+)
+def test_what_cannot_be_used_is_named(
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    assert run(recording, tmp_path / "out", *options) == UNUSABLE
+    assert message in capsys.readouterr().err
+
+
+def test_no_recording_is_exit_code_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tmp_path / "nowhere", tmp_path / "out") == UNUSABLE
+    assert "nowhere does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "wrong", [["--max-frames", "0"], ["--stride", "-1"], ["--depth-max", "0"], ["--out"]]
+)
+def test_wrong_options_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        parse(["walk", "--out", "out", *wrong])
+    assert end.value.code == 2
+    assert wrong[0] in capsys.readouterr().err
