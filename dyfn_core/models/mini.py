@@ -27,6 +27,9 @@ from dyfn_core.models.efficientnet import (
 CELL = 16  # pixels along the side of one token of the budget
 MULTIPLE = 32  # network sizes are multiples of the encoder's largest stride
 LATENT_STRIDE = 8
+FEATURE_SPREAD = (7.0, 6.0, 2.5)  # standard deviations of the ImageNet encoder's features
+VIEW_SLOPE = 0.8  # x / z at the edge of a view plane of unit half diagonal, before training
+RAW_LIMIT = 8.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,9 @@ class Neck(nn.Module):
         self.project_deep = nn.Conv2d(config.context_channels, channels, 1)
 
     def forward(self, features: list[Tensor]) -> Tensor:
-        fine, middle, deep = features
+        fine, middle, deep = (
+            feature / spread for feature, spread in zip(features, FEATURE_SPREAD, strict=True)
+        )
         size = fine.shape[-2:]
         deep = self.project_deep(self.context(self.context_in(deep)))
         coarse = self.project_middle(middle) + _resize(deep, middle.shape[-2:])
@@ -128,11 +133,11 @@ class Decoder(nn.Module):
             stages.append(ResidualBlock(width))
             channels = width
         self.joins, self.stages = nn.ModuleList(joins), nn.ModuleList(stages)
+        out = nn.Conv2d(32, 3 * 4, 1)
+        nn.init.normal_(out.weight, std=1e-2)
+        nn.init.zeros_(out.bias)  # type: ignore[arg-type]
         self.points = nn.Sequential(
-            nn.Conv2d(channels + 2, 32, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(32, 3 * 4, 1),
-            nn.PixelShuffle(2),
+            nn.Conv2d(channels + 2, 32, 3, padding=1), nn.ReLU(), out, nn.PixelShuffle(2)
         )
         self.mask = nn.Sequential(
             nn.Conv2d(channels + 2, 16, 3, padding=1),
@@ -149,7 +154,11 @@ class Decoder(nn.Module):
                 x = _resize(x, (x.shape[-2] * 2, x.shape[-1] * 2))
             x = stage(x)
         x = _with_view_plane(x, aspect)
-        return self.points(x), self.mask(x)
+        points = self.points(x)
+        # Untrained, the points are a plane facing a pinhole camera: from anything less regular
+        # the best scale is near zero, and so is the gradient.
+        rays = VIEW_SLOPE * _view_plane(points, aspect)
+        return torch.cat([points[:, :2] + rays, points[:, 2:]], dim=1), self.mask(x)
 
 
 class MiniModel(GeometryModel):
@@ -238,8 +247,11 @@ class MiniModel(GeometryModel):
 
 
 def remap_exp(raw: Tensor) -> Tensor:
-    """Raw points B x 3 x h x w -> B x h x w x 3: z = exp(z_raw), xy = xy_raw z."""
-    z = raw[:, 2:].exp()
+    """Raw points B x 3 x h x w -> B x h x w x 3: z = exp(z_raw), xy = xy_raw z.
+
+    z_raw is bounded so that no step of training can reach an infinite z.
+    """
+    z = raw[:, 2:].clamp(-RAW_LIMIT, RAW_LIMIT).exp()
     return torch.cat([raw[:, :2] * z, z], dim=1).permute(0, 2, 3, 1)
 
 
@@ -247,12 +259,18 @@ def _resize(x: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
     return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
 
 
-def _with_view_plane(x: Tensor, aspect: float) -> Tensor:
-    """x with two more channels: position on the view plane, its diagonal spanning -1 to 1."""
-    batch, _, height, width = x.shape
+def _view_plane(like: Tensor, aspect: float) -> Tensor:
+    """B x 2 x h x w: position on the view plane, whose diagonal spans -1 to 1."""
+    batch, _, height, width = like.shape
     span_x = aspect / math.hypot(aspect, 1)
     span_y = 1 / math.hypot(aspect, 1)
-    u = torch.linspace(-1 + 1 / width, 1 - 1 / width, width, dtype=x.dtype, device=x.device)
-    v = torch.linspace(-1 + 1 / height, 1 - 1 / height, height, dtype=x.dtype, device=x.device)
+    u = torch.linspace(-1 + 1 / width, 1 - 1 / width, width, dtype=like.dtype, device=like.device)
+    v = torch.linspace(
+        -1 + 1 / height, 1 - 1 / height, height, dtype=like.dtype, device=like.device
+    )
     plane = torch.stack(torch.meshgrid(u * span_x, v * span_y, indexing="xy"))
-    return torch.cat([x, plane.expand(batch, -1, -1, -1)], dim=1)
+    return plane.expand(batch, -1, -1, -1)
+
+
+def _with_view_plane(x: Tensor, aspect: float) -> Tensor:
+    return torch.cat([x, _view_plane(x, aspect)], dim=1)

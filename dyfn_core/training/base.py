@@ -24,6 +24,7 @@ from dyfn_core.training.trainer import Task, picture_rows
 from dyfn_core.training.validation import Example, recording_examples, score, shard_examples
 
 LOCAL_LEVELS = (1 / 4, 1 / 16)
+LARGEST_RAW = 4.0  # raw points beyond this are pulled back: the losses do not fix their scale
 
 
 def clip_source(config: RunConfig, length: int, strides: tuple[int, int]) -> ClipSource:
@@ -73,14 +74,16 @@ class BaseTask(Task):
             for alpha, balls in zip(LOCAL_LEVELS, self.config.balls, strict=True)
         ]
         normal, masks = normal_loss(points, target), mask_loss(mask, target)
+        excess = (raw.abs() - LARGEST_RAW).clamp(min=0).square().mean()
         total = (
             frame
             + self.config.local_weight * torch.stack(local).sum()
             + self.config.normal_weight * normal
             + self.config.mask_weight * masks
+            + excess
         )
-        names = ("loss", "frame", "local_4", "local_16", "normal", "mask")
-        terms = (total, frame, *local, normal, masks)
+        names = ("loss", "frame", "local_4", "local_16", "normal", "mask", "excess")
+        terms = (total, frame, *local, normal, masks, excess)
         return total, {name: float(term.detach()) for name, term in zip(names, terms, strict=True)}
 
     def _forward(self, batch: ClipBatch) -> tuple[Tensor, Tensor, float]:
@@ -109,6 +112,7 @@ class BaseTask(Task):
 
 def build_base(config: BaseRunConfig) -> MiniModel:
     """The model at step 0: ImageNet weights in the encoder, or a checkpoint."""
+    torch.manual_seed(config.seed)
     if config.initial is not None:
         model = load_model(Path(config.initial))
         if not isinstance(model, MiniModel):
