@@ -185,7 +185,8 @@ def assemble(
         points = torch.cat([affine.points[..., :2], depth[..., None]], dim=-1)
     if apply_mask:
         depth = torch.where(valid, depth, torch.inf)
-        points = torch.where(valid[..., None], points, torch.inf)
+        invalid = (~valid).reshape(-1).nonzero()[:, 0]  # a mask broadcast over xyz is slow
+        points = points.reshape(-1, 3).index_fill_(0, invalid, torch.inf).reshape(points.shape)
     return Prediction(points, depth, valid, intrinsics, state)
 
 
