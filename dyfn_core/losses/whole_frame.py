@@ -10,7 +10,7 @@ from dyfn_core.losses.target import Target
 
 GRID = (10, 12)
 ANCHORS = 16
-TRUNC = 1.0
+LINEAR_TO = 1.0
 
 
 def coarse_samples(target: Target, grid: tuple[int, int]) -> Tensor:
@@ -31,7 +31,10 @@ def pick(values: Tensor, index: Tensor) -> Tensor:
 
 
 def align_frames(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """Scale (B) and z-shift (B x 3) of each frame on a coarse grid, truncated weighted L1.
+    """Scale (B) and z-shift (B x 3) of each frame on a coarse grid, weighted L1.
+
+    Not truncated: the best (s, t) is then never worse than a constant, which bounds the loss
+    while the prediction is still far off.
 
     The anchors are a subset of the grid's samples, drawn with torch's generator.
     """
@@ -41,13 +44,15 @@ def align_frames(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
         pick(points.detach(), index),
         pick(target.points, index),
         pick(target.weight(), index),
-        TRUNC,
+        None,
         anchors,
     )
 
 
 def whole_frame_loss(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
     """Mean over frames of mean_i |s p_i + t - p*_i|_1 / z*_i, one (s, t) per frame, detached.
+
+    A pixel's error grows only logarithmically beyond LINEAR_TO.
 
     points: B x H x W x 3. Returns the loss and the scales (B); a frame whose best scale is not
     positive, or that has nothing valid, counts 0.
@@ -56,6 +61,9 @@ def whole_frame_loss(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:
     usable = (scale > 0) & target.valid.flatten(1).any(1)
     aligned = scale[:, None, None, None] * points + shift[:, None, None, :]
     error = target.weight() * (aligned - target.points).abs().sum(-1)
+    error = torch.where(
+        error > LINEAR_TO, LINEAR_TO + torch.log(error.clamp(min=LINEAR_TO) / LINEAR_TO), error
+    )
     count = target.valid.sum((1, 2)).clamp(min=1)
     per_frame = torch.where(usable, error.sum((1, 2)) / count, 0.0)
     return per_frame.mean(), scale

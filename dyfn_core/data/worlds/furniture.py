@@ -18,7 +18,7 @@ from trimesh.resolvers import ZipResolver
 
 from dyfn_core.data.worlds.scene import SceneBuilder, fit_texture, new_vertices
 
-MAX_MODEL_BYTES = 700_000
+MAX_MODEL_BYTES = 400_000
 SMALL = 0.45
 
 

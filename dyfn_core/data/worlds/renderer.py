@@ -194,9 +194,10 @@ class Renderer:
         self.target.use()
         self.target.viewport = (0, 0, width, height)
         self.target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
-        self.target.color_mask = ((False,) * 4, (False,) * 4)
-        self.depth_mesh.render()
-        self.target.color_mask = ((True,) * 4, (True,) * 4)
+        if shrink == 1:  # depth first, so that each pixel is shaded once; not worth it when small
+            self.target.color_mask = ((False,) * 4, (False,) * 4)
+            self.depth_mesh.render()
+            self.target.color_mask = ((True,) * 4, (True,) * 4)
         self.mesh.render()
         view_box = (0, 0, width, height)
         rgba = np.frombuffer(self.target.read(view_box, components=4), np.uint8)
