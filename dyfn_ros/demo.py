@@ -1,0 +1,191 @@
+"""`dyfn-demo`: the demo recording through the live node over DDS, with and without DyFN."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from dyfn_core.evaluation.pictures import encode_picture
+from dyfn_core.evaluation.report import Picture, Section, Text, text_table, write_report
+from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, score_table
+from dyfn_ros.environment import prepare_environment
+from dyfn_ros.node_process import NODE_COMMAND, LiveError, NodeProcess
+from dyfn_ros.recording_writer import COMPRESSED_IMAGE
+from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
+from dyfn_ros.replay import SCORE_NOTE
+
+if TYPE_CHECKING:
+    from dyfn_ros.live_player import LivePlayer
+
+OK, FAILED, UNUSABLE = 0, 1, 2
+RUNS = {"with DyFN": True, "without (base model)": False}
+DOMAINS = 100  # DDS domains whose ports are below the ephemeral range
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to play and where to put the results."""
+
+    recording: Path
+    out: Path
+    model: str = "dyfn-mini"
+    max_frames: int | None = None
+    domain: int = 1
+
+
+def parse(arguments: Sequence[str] | None = None) -> Options:
+    """Command line -> Options."""
+    parser = argparse.ArgumentParser(
+        prog="dyfn-demo",
+        description="Play a recording through the live node over DDS on this machine, with and "
+        "without DyFN, and score what comes back.",
+        epilog="Exit code: 0 done, 1 the node failed, 2 the recording cannot be used.",
+    )
+    parser.add_argument("--recording", type=Path, default=default_recording())
+    parser.add_argument("--out", type=Path, default=Path("out/demo"))
+    parser.add_argument("--model", default="dyfn-mini")
+    parser.add_argument("--max-frames", type=int)
+    parser.add_argument("--domain", type=int, default=1 + os.getpid() % DOMAINS)
+    return Options(**vars(parser.parse_args(arguments)))
+
+
+def default_recording() -> Path:
+    """bags/demo here, else in the source tree."""
+    here = Path("bags/demo")
+    return here if here.exists() else Path(__file__).resolve().parents[1] / here
+
+
+def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, SequenceEvaluation]:
+    """Play the recording once per run through one live node and write the report.
+
+    Raises RecordingError (the recording), LiveError (the node), ImportError (no ROS).
+    """
+    recording = open_recording(options.recording)
+    first = next(recording.frames(), None)
+    if first is None:
+        raise RecordingError(f"{options.recording}: no frame could be read")
+    options.out.mkdir(parents=True, exist_ok=True)
+    prepare_environment()
+    os.environ["ROS_DOMAIN_ID"] = str(options.domain)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    from dyfn_ros.live_player import LivePlayer
+
+    parameters = {
+        "model": options.model,
+        "drop_frames": False,
+        "wait_for_camera_info": first.info is not None,
+        "image_transport": "compressed" if first.source.kind == COMPRESSED_IMAGE else "raw",
+    }
+    namespace = f"/dyfn_demo_{os.getpid()}"  # no other node on the machine is mistaken for ours
+    with (
+        NodeProcess(options.out / "node.log", parameters, namespace, command) as process,
+        LivePlayer(process, first.source.kind, options.domain, namespace) as player,
+    ):
+        print(f"waiting for the node (model {options.model}) ...", file=sys.stderr)
+        player.prime(first)
+        runs = {
+            name: _run(name, stabilize, player, recording, options.max_frames)
+            for name, stabilize in RUNS.items()
+        }
+    _write(options, recording, runs)
+    return runs
+
+
+def _run(
+    name: str, stabilize: bool, player: LivePlayer, recording: Recording, limit: int | None
+) -> SequenceEvaluation:
+    player.reset(stabilize)
+    expected = min(recording.expected_frames, limit or recording.expected_frames)
+    evaluation = SequenceEvaluation(expected)
+    frames = islice(recording.frames(), limit)
+    results = player.play(frames)
+    for result in tqdm(results, total=expected, desc=name, unit="frame", file=sys.stderr):
+        _check_cloud(result.frame, result.depth, result.cloud)
+        evaluation.push(
+            result.frame.image,
+            result.depth,
+            np.isfinite(result.depth),
+            result.frame.depth,
+            stamp=result.frame.stamp_ns / 1e9,
+            latency=result.latency,
+        )
+    return evaluation
+
+
+def _check_cloud(frame: RecordedFrame, depth: np.ndarray, cloud: np.ndarray) -> None:
+    """The cloud must be the depth, point for pixel."""
+    if not np.array_equal(cloud["z"], depth, equal_nan=True):
+        raise LiveError(f"frame {frame.index}: the cloud's z is not the depth image")
+
+
+def _write(options: Options, recording: Recording, runs: dict[str, SequenceEvaluation]) -> None:
+    results = {name: run.results() for name, run in runs.items()}
+    out = options.out
+    table = score_table(results)
+    strips = {name: run.draw_strip() for name, run in runs.items()}
+    sections = [
+        Section("Scores", [table, Text(SCORE_NOTE + LATENCY_NOTE, note=True)]),
+        *(Section(f"Frames, {name}", [Picture(strips[name], name)]) for name in runs),
+    ]
+    if all(result["image"] is not None for result in results.values()):
+        curves = curve_picture(runs)
+        (out / "curves.png").write_bytes(encode_picture(curves))
+        sections.insert(1, Section("Over time", [Picture(curves, "scale and error", False)]))
+    for (_, stabilize), strip in zip(RUNS.items(), strips.values(), strict=True):
+        name = "strip_dyfn.png" if stabilize else "strip_base.png"
+        (out / name).write_bytes(encode_picture(strip))
+    notes = [*recording.notes.losses, *recording.notes.warnings]
+    if notes:
+        sections.append(Section("Losses and warnings", [Text(note) for note in notes]))
+    write_report(out / "report.html", f"{options.model}, live over DDS", sections)
+    summary: dict[str, Any] = {"model": options.model, "runs": results}
+    (out / "metrics.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    print(text_table(table))
+    frames = next(iter(runs.values())).frames
+    print(f"{frames} frames of {options.recording}, none lost; clouds equal to the depth images")
+    print(f"report with pictures: {out / 'report.html'}")
+
+
+LATENCY_NOTE = " Latency: from publishing the image to receiving its depth, over DDS."
+
+
+def main(arguments: Sequence[str] | None = None, command: Sequence[str] = NODE_COMMAND) -> int:
+    """-> exit code."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    options = parse(arguments)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the node too
+    try:
+        demo(options, command)
+    except RecordingError as error:
+        print(f"dyfn-demo: {error}", file=sys.stderr)
+        return UNUSABLE
+    except ImportError as error:
+        print(
+            f"dyfn-demo: ROS 2 is not available ({error}): source its setup file, or install this "
+            "package with its `ros` extra",
+            file=sys.stderr,
+        )
+        return FAILED
+    except KeyboardInterrupt:
+        print("dyfn-demo: interrupted", file=sys.stderr)
+        return 130
+    except LiveError as error:
+        print(f"dyfn-demo: {error}", file=sys.stderr)
+        return FAILED
+    return OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())
