@@ -141,8 +141,10 @@ def decode_camera_info(
         matrix = np.array(_field(info, "p"), np.float64).reshape(3, 4)[:, :3].copy()
     if matrix[0, 0] == 0:
         raise MessageError(f"uncalibrated: {'P' if rectified else 'K'}[0] is 0")
-    if not np.isfinite(matrix).all() or matrix[0, 0] < 0 or matrix[1, 1] <= 0 or matrix[2, 2] != 1:
-        raise MessageError(f"no pinhole camera matrix: {matrix.tolist()}")
+    pinhole = [[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]]
+    usable = np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
+    if not usable or not np.array_equal(matrix, pinhole):
+        raise MessageError(f"no pinhole camera matrix [fx 0 cx; 0 fy cy; 0 0 1]: {matrix.tolist()}")
     x, y, w, h = _window(info)
     bin_x, bin_y = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
     if (h // bin_y, w // bin_x) != (height, width):

@@ -58,12 +58,16 @@ class Job:
 
 @dataclass
 class Counts:
-    """Frames since the start. bad: not decodable. failed: inference raised."""
+    """Frames since the start.
+
+    bad: not decodable. failed: inference raised. unpublished: the shutdown came first.
+    """
 
     received: int = 0
     published: int = 0
     bad: int = 0
     failed: int = 0
+    unpublished: int = 0
 
 
 def load_bundled(name: str, device: str) -> GeometryModel:
@@ -106,6 +110,14 @@ class StreamDepthNode(Node):
     @property
     def settings(self) -> Settings:
         return self._table.settings
+
+    def _warn(self, text: str) -> None:
+        if line := self._throttle(text):
+            self.get_logger().warning(line)
+
+    def _error(self, text: str) -> None:
+        if line := self._throttle(text):
+            self.get_logger().error(line)
 
     def _advertise(self) -> None:
         self._depth = self._publisher(Image, "~/depth/image")
@@ -153,8 +165,7 @@ class StreamDepthNode(Node):
     def _on_image(self, message: Any) -> None:
         self.counts.received += 1
         if not self.worker.submit(Job(message, self._info, self._epoch)):
-            self._throttle(
-                self.get_logger().error,
+            self._error(
                 f"{self._images.topic_name}: queue_size of {self.settings.queue_size} frames is "
                 "full, newer frames are lost; play slower or raise it",
             )
@@ -192,13 +203,14 @@ class StreamDepthNode(Node):
             self._process(job)
         except MessageError as error:
             self.counts.bad += 1
-            self._throttle(self.get_logger().warning, f"{self._images.topic_name}: {error}")
+            self._warn(f"{self._images.topic_name}: {error}")
         except Exception as error:
             if not self.context.ok():  # shut down under our feet: there is nobody to publish to
+                self.counts.unpublished += 1
                 return
             self.counts.failed += 1
             text = f"{self._images.topic_name}: inference failed, the stream starts anew"
-            self._throttle(self.get_logger().error, f"{text}: {type(error).__name__}: {error}")
+            self._error(f"{text}: {type(error).__name__}: {error}")
 
     def _process(self, job: Job) -> None:
         settings = self.settings
@@ -231,13 +243,10 @@ class StreamDepthNode(Node):
             rectified = self.settings.rectified
             calibration = messages.decode_camera_info(info, *image.shape[:2], rectified=rectified)
         except MessageError as error:
-            self._throttle(
-                self.get_logger().warning, f"{topic}: {error}; going on without intrinsics"
-            )
+            self._warn(f"{topic}: {error}; going on without intrinsics")
             return None, None
         if calibration.distorted:
-            self._throttle(
-                self.get_logger().warning,
+            self._warn(
                 f"{topic}: the lens is distorted (D is not 0), which is not undone here; "
                 "rectified images (parameter `rectified`) give better geometry",
             )
@@ -263,10 +272,10 @@ class StreamDepthNode(Node):
         done = self.worker.stop(_PATIENCE)
         logger, counts = self.get_logger(), self.counts
         self.destroy_node()  # first: a signal has ended the context that rosout needs
+        dropped = self.worker.dropped + counts.unpublished
         logger.info(
-            f"{counts.received} frames received, {counts.published} worked on, "
-            f"{self.worker.dropped} dropped, {counts.bad} bad, {counts.failed} failed; "
-            f"{self._epoch} resets"
+            f"{counts.received} frames received, {counts.published} worked on, {dropped} dropped, "
+            f"{counts.bad} bad, {counts.failed} failed; {self._epoch} resets"
         )
         return done
 
@@ -297,7 +306,7 @@ def _spin(args: Sequence[str] | None, load: ModelLoader) -> tuple[int, StreamDep
         executor.add_node(node)
         executor.spin_until_future_complete(node.model_failed)
         if node.model_failed.done():
-            node.get_logger().fatal(f"cannot run: {node.model_failed.result()}")
+            node.get_logger().fatal(f"cannot run: {node.model_failed.result()!r}")
             return 1, node
     except (KeyboardInterrupt, ExternalShutdownException):
         pass

@@ -22,19 +22,22 @@ class Throttle:
         self._kept_back: dict[str, int] = {}
         self._lock = threading.Lock()
 
-    def __call__(self, log: Callable[[str], object], text: str) -> None:
-        """Call `log` with the text, or count it."""
+    def __call__(self, text: str) -> str:
+        """What to log now: the text, with what was kept back before it; or "" for nothing.
+
+        (rclpy identifies a log call by its line of code, so the logging is left to the caller.)
+        """
         with self._lock:
             now = self._clock()
             self._last = {t: at for t, at in self._last.items() if now - at < self._period}
             if text in self._last or len(self._last) >= self._limit:
                 key = text if text in self._last else ""
                 self._kept_back[key] = self._kept_back.get(key, 0) + 1
-                return
+                return ""
             self._last[text] = now
             again = self._kept_back.pop(text, 0)
             others = self._kept_back.pop("", 0)
             self._kept_back = {t: n for t, n in self._kept_back.items() if t in self._last}
         more = [f"{again} more of these before"] if again else []
         more += [f"{others} other messages not shown"] if others else []
-        log(f"{text} ({'; '.join(more)})" if more else text)
+        return f"{text} ({'; '.join(more)})" if more else text

@@ -198,6 +198,7 @@ def test_binning_and_region_move_rays_with_their_pixels(
         ({"k": [-1.0, *K[1:]]}, "no pinhole"),
         ({"k": [*K[:4], 0.0, *K[5:]]}, "no pinhole"),
         ({"k": [*K[:8], 0.0]}, "no pinhole"),
+        ({"k": [K[0], 0.5, *K[2:]]}, "no pinhole"),
     ],
 )
 def test_unusable_calibrations_say_why(fields: dict[str, Any], match: str) -> None:

@@ -1,0 +1,80 @@
+"""A geometry model that is small, seeded and real: convolutions around one latent, and DyFN.
+
+Two pictures make it behave badly on demand: see FAILING and BLOCKING.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
+
+FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
+BLOCKING = (9, 8, 7)  # this one makes it say so in the pipe $TINY_ENTERED and wait for $TINY_GO
+CHANNELS = 6
+
+
+class TinyModel(GeometryModel):
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Conv2d(3, CHANNELS, 5, stride=4, padding=2)
+        self.head = nn.Conv2d(CHANNELS, 2, 3, padding=1)
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> GeometryModel:
+        return cls()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {"type": "tiny"}
+
+    @property
+    def latent_channels(self) -> int:
+        return CHANNELS
+
+    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
+        first = tuple((image[0, :, 0, 0] * 255).round().int().tolist())
+        if first == FAILING:
+            raise RuntimeError("the picture that must fail")
+        if first == BLOCKING:
+            wait_for_go()
+        size = (image.shape[-2], image.shape[-1])
+        return Latent(self.encoder(image), size, size)
+
+    def decode(self, latent: Latent) -> AffinePoints:
+        height, width = latent.image_size
+        raw = functional.interpolate(self.head(latent.features), latent.image_size, mode="bilinear")
+        z = torch.exp(raw[:, 0])
+        v, u = torch.meshgrid(
+            (torch.arange(height) + 0.5 - height / 2) / width,
+            (torch.arange(width) + 0.5) / width - 0.5,
+            indexing="ij",
+        )
+        points = torch.stack([u * z, v * z, z], dim=-1)
+        return AffinePoints(points, raw[:, 1] - raw[:, 1].mean() + 0.9)
+
+
+def wait_for_go() -> None:
+    Path(os.environ["TINY_ENTERED"]).write_bytes(b".")
+    with Path(os.environ["TINY_GO"]).open("rb", buffering=0) as go:
+        go.read(1)
+
+
+def load_tiny(name: str = "tiny", device: str = "cpu") -> GeometryModel:
+    """The same weights each time; a stabilizer whose state clearly matters."""
+    if name != "tiny":
+        raise ValueError(f"model {name!r} is unknown, expected 'tiny'")
+    model = TinyModel()
+    model.stabilizer = build_stabilizer(CHANNELS, StabilizerConfig(hidden=8))
+    generator = torch.Generator().manual_seed(7)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.normal_(0, 0.25, generator=generator)
+    return model.eval()
