@@ -52,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--assets", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("bags/demo"))
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--seed", type=int, default=27)
     parser.add_argument("--frames", type=int, default=180)
     options = parser.parse_args()
     views = render(options.assets, options.seed, options.frames)
