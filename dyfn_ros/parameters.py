@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,25 @@ class Settings:
         if self.reliability == "auto":
             return not self.drop_frames
         return self.reliability == "reliable"
+
+
+def usage(arguments: Sequence[str]) -> None:
+    """Take what is not for ROS from the command line: --help, or an error that ends the program.
+
+    arguments: with the program's name first.
+    """
+    lines = [
+        f"  {name:22}{spec.description} [{str(spec.default).lower()}]"
+        for name, spec in SPECS.items()
+    ]
+    parser = argparse.ArgumentParser(
+        prog="stream_depth",
+        usage="stream_depth [--ros-args -r image:=TOPIC -r camera_info:=TOPIC -p NAME:=VALUE ...]",
+        description="Images in, depth and clouds out. Parameters and [defaults]:",
+        epilog="\n".join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.parse_args(remove_ros_args(list(arguments))[1:])
 
 
 def _descriptor(spec: Spec) -> ParameterDescriptor:

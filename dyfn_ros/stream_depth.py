@@ -11,11 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rclpy
-from rclpy.exceptions import (
-    InvalidParameterTypeException,
-    InvalidParameterValueException,
-    ParameterException,
-)
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -30,7 +26,7 @@ from dyfn_ros import messages
 from dyfn_ros.camera_stream import CameraStream, Geometry, stream_maker
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.messages import MessageError
-from dyfn_ros.parameters import NodeParameters, Settings
+from dyfn_ros.parameters import NodeParameters, Settings, usage
 from dyfn_ros.throttle import Throttle
 from dyfn_ros.worker import FrameWorker
 
@@ -41,6 +37,7 @@ ModelLoader = Callable[[str, str], "GeometryModel"]
 
 _SENSOR_DEPTH = 5
 _OUTPUT_DEPTH = 5
+_LOSSLESS_DEPTH = 100  # of the outputs; a cloud of 640 x 480 is 10 MB
 _PATIENCE = 4.0  # seconds; ROS launch loses its own after 5
 
 
@@ -78,7 +75,7 @@ def load_bundled(name: str, device: str) -> GeometryModel:
 
 
 class StreamDepthNode(Node):
-    """See the README's table for topics, services and parameters.
+    """Topics, service and parameters: docs/node.md.
 
     Callbacks only store and queue; decoding, inference and publishing happen in one worker
     thread. `model_failed` is done, with the reason, when the model could not be loaded.
@@ -126,7 +123,7 @@ class StreamDepthNode(Node):
         self.create_service(Trigger, "~/reset", self._on_reset)
 
     def _publisher(self, kind: type, topic: str) -> Publisher:
-        depth = _OUTPUT_DEPTH if self.settings.drop_frames else self.settings.queue_size
+        depth = _OUTPUT_DEPTH if self.settings.drop_frames else _LOSSLESS_DEPTH
         return self.create_publisher(
             kind,
             topic,
@@ -136,7 +133,9 @@ class StreamDepthNode(Node):
 
     def _subscribe(self, settings: Settings) -> None:
         if settings.image_transport == "compressed":
-            self._images = self._subscription(CompressedImage, "image/compressed", self._on_image)
+            # Beside the image topic, also when that is remapped, as image_transport has it.
+            topic = f"{self.resolve_topic_name('image')}/compressed"
+            self._images = self._subscription(CompressedImage, topic, self._on_image)
         else:
             self._images = self._subscription(Image, "image", self._on_image)
         self._infos = self._subscription(CameraInfo, "camera_info", self._on_info)
@@ -296,37 +295,41 @@ def _sibling_info(header: Any, info: CameraInfo | None, geometry: Geometry) -> C
     return sibling
 
 
-def _spin(args: Sequence[str] | None, load: ModelLoader) -> tuple[int, StreamDepthNode | None]:
-    """Until a signal or a failure. -> exit code, and the node if there is one to close."""
-    node: StreamDepthNode | None = None
+def _start(args: Sequence[str] | None, load: ModelLoader) -> StreamDepthNode | None:
+    """The node; None, and the reason on stderr, when ROS or the parameters do not allow one."""
     try:
+        usage(sys.argv if args is None else args)
         rclpy.init(args=None if args is None else list(args))
-        node = StreamDepthNode(load)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        executor.spin_until_future_complete(node.model_failed)
-        if node.model_failed.done():
-            node.get_logger().fatal(f"cannot run: {node.model_failed.result()!r}")
-            return 1, node
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except (
-        InvalidParameterTypeException,
-        InvalidParameterValueException,
-        ParameterException,
-    ) as error:
+        return StreamDepthNode(load)
+    except (ParameterException, RuntimeError) as error:  # RuntimeError: what rcl does not accept
         print(f"stream_depth: {error}", file=sys.stderr)
-        return 1, node
-    return 0, node
+        return None
+
+
+def _spin(node: StreamDepthNode) -> int:
+    """Until the context ends or the model fails. -> exit code."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin_until_future_complete(node.model_failed)
+    if not node.model_failed.done():
+        return 0
+    node.get_logger().fatal(f"cannot run: {node.model_failed.result()!r}")
+    return 1
 
 
 def main(args: Sequence[str] | None = None, load: ModelLoader = load_bundled) -> int:
     """-> exit code: 0 after SIGINT or SIGTERM, 1 when the node cannot run.
 
-    load: (name, device) -> model.
+    args: the command line; None takes sys.argv. load: (name, device) -> model.
     """
     prepare_environment()
-    code, node = _spin(args, load)
+    node: StreamDepthNode | None = None
+    code = 0
+    try:
+        node = _start(args, load)
+        code = 1 if node is None else _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
     done = node is None or node.close()
     rclpy.try_shutdown()
     if not done:  # a download, or a huge model: the interpreter cannot end under a running thread

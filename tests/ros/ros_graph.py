@@ -16,9 +16,10 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 HERE = Path(__file__).parent
-DEADLINE = 40.0
+DEADLINE = 90.0  # a busy machine imports torch slowly
 NODE = "/stream_depth"
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
@@ -102,12 +103,19 @@ class NodeProcess:
             self.process.wait()
 
 
-def tiny_node(environment: dict[str, str], folder: Path, **parameters: Any) -> NodeProcess:
+def tiny_node(
+    environment: dict[str, str],
+    folder: Path,
+    remap: Mapping[str, str] = MappingProxyType({}),
+    **parameters: Any,
+) -> NodeProcess:
     """stream_depth with the tiny model and one inference thread."""
     command = [sys.executable, str(HERE / "tiny_node.py"), "--ros-args"]
     values = {"model": "tiny", "device": "cpu", "threads": 1, **parameters}
     for name, value in values.items():
         command += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
+    for name, target in remap.items():
+        command += ["-r", f"{name}:={target}"]
     return NodeProcess(command, environment, folder)
 
 
@@ -121,6 +129,7 @@ class Client:
         image_type: type = Image,
         image_qos: QoSProfile = RELIABLE,
         subscribe: bool = True,
+        image: str = "image",
     ) -> None:
         os.environ.update(environment)
         self.context = Context()
@@ -128,7 +137,7 @@ class Client:
         self.node = rclpy.create_node("client", context=self.context, enable_rosout=False)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        topic = "image" if image_type is Image else "image/compressed"
+        topic = image if image_type is Image else f"{image}/compressed"
         self.images = self.node.create_publisher(image_type, topic, image_qos)
         self.infos = self.node.create_publisher(CameraInfo, "camera_info", RELIABLE)
         self.received: dict[int, dict[str, Any]] = defaultdict(dict)

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter
 
-from dyfn_ros.parameters import SPECS, Settings, check
+from dyfn_ros.parameters import SPECS, Settings, check, usage
 
 CONFIG = Path(__file__).parents[2] / "config/stream_depth.yaml"
 
@@ -67,3 +67,27 @@ def test_auto_reliability_follows_drop_frames(
     values = {name: spec.default for name, spec in SPECS.items()}
     values.update(reliability=reliability, drop_frames=drop_frames)
     assert Settings(**values).reliable is reliable  # type: ignore[arg-type]
+
+
+def test_the_manual_lists_every_parameter_as_it_is() -> None:
+    rows = [
+        f"| `{name}`{'*' if spec.read_only else ''} | {str(spec.default).lower()} "
+        f"| {spec.description} |"
+        for name, spec in SPECS.items()
+    ]
+    manual = (CONFIG.parents[1] / "docs/node.md").read_text()
+    assert [line for line in manual.splitlines() if line.startswith("| `")][-len(rows) :] == rows
+
+
+def test_help_shows_parameters_and_strange_arguments_are_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    usage(["stream_depth", "--ros-args", "-p", "model:=x"])
+    with pytest.raises(SystemExit) as asked:
+        usage(["stream_depth", "--help"])
+    assert asked.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown and spec.description in shown for name, spec in SPECS.items())
+    with pytest.raises(SystemExit) as refused:
+        usage(["stream_depth", "--model", "x"])
+    assert refused.value.code == 2

@@ -421,8 +421,13 @@ def test_depth_alone_is_built_for_its_subscriber_and_an_interrupt_waits_for_nobo
 
 def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
     """Frames that come before the CameraInfo are held, and then all have its intrinsics."""
-    node = graph.start(image_transport="compressed", drop_frames=False, wait_for_camera_info=True)
-    client = graph.connect(image_type=CompressedImage)
+    node = graph.start(
+        image_transport="compressed",
+        drop_frames=False,
+        wait_for_camera_info=True,
+        remap={"image": "/front/image"},
+    )
+    client = graph.connect(image_type=CompressedImage, image="/front/image")
     client.settle()
     images = frames(4)
     stamps = []
@@ -438,7 +443,7 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
     client.send_info(camera_info())
     matrix = np.reshape(camera_info().k, (3, 3))
     assert depth_bytes([client.result(s) for s in stamps]) == offline(images, matrix)
-    node.wait_log(r"WARN\].*/image/compressed: .*neither JPEG nor PNG")
+    node.wait_log(r"WARN\].*/front/image/compressed: .*neither JPEG nor PNG")
     assert node.end() == 0
 
 
@@ -449,6 +454,11 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
         ({"image_transport": "theora"}, r"stream_depth: .*image_transport is 'theora', expected"),
         ({"queue_size": 0}, r"stream_depth: .*queue_size out of range"),
         ({"queue_size": "many"}, r"stream_depth: .*'queue_size'.*expecting type 'INTEGER'"),
+        ({"remap": {"image": "a//b"}}, r"stream_depth: .*Couldn't parse remap rule"),
+        (
+            {"qos_overrides./image.subscription.reliability": "some"},
+            r"stream_depth: Unexpected QoS override for policy `reliability`: `some`",
+        ),
     ],
 )
 def test_a_node_that_cannot_run_says_why_and_exits_with_one(
