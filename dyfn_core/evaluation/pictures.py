@@ -146,6 +146,38 @@ def _write(image: np.ndarray, text: str, corner: tuple[int, int]) -> None:
         )
 
 
+def draw_cloud(
+    points: np.ndarray, colours: np.ndarray, size: tuple[int, int] = (360, 480)
+) -> np.ndarray:
+    """A cloud seen from the right and above the camera that took it, nearer points in front.
+
+    points: ... x 3 in the optical frame, not finite where invalid; colours: ... x 3 uint8 RGB.
+    The unit does not matter. Returns size[0] x size[1] x 3 uint8 RGB, white where nothing is.
+    """
+    picture = np.full((*size, 3), 255, np.uint8)
+    valid = np.isfinite(points).all(axis=-1)
+    if not valid.any():
+        return picture
+    xyz, rgb = points[valid].astype(np.float64), colours[valid]
+    middle = np.median(xyz[:, 2])
+    yaw, pitch = np.radians(-28), np.radians(18)
+    turn_y = [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
+    turn_x = [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
+    seen = (xyz / middle - [0, 0, 1]) @ (np.array(turn_x) @ np.array(turn_y)).T + [0, 0, 1.7]
+    seen, rgb = seen[seen[:, 2] > 0.1], rgb[seen[:, 2] > 0.1]
+    order = np.argsort(-seen[:, 2], kind="stable")  # far first, so that near ones paint over
+    focal = 0.9 * size[1]
+    columns, rows = (
+        np.round(focal * seen[order, i] / seen[order, 2] + size[1 - i] / 2).astype(int)
+        for i in (0, 1)
+    )
+    u = (columns[:, None] + [0, 1, 0, 1]).ravel()  # a point is 2 x 2 pixels
+    v = (rows[:, None] + [0, 0, 1, 1]).ravel()
+    inside = (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
+    picture[v[inside], u[inside]] = np.repeat(rgb[order], 4, axis=0)[inside]
+    return picture
+
+
 def curves(
     panels: Mapping[str, Mapping[str, Sequence[float | None]]], x_label: str = "frame"
 ) -> np.ndarray:

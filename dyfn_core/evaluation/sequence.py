@@ -47,6 +47,7 @@ class SequenceEvaluation:
         self._stamps: list[float] = []
         self._latencies: list[float] = []
         self._hash = hashlib.sha256()
+        self._video: tuple[int, SequenceScore | None] = (0, None)
 
     def push(
         self,
@@ -91,10 +92,16 @@ class SequenceEvaluation:
         p50, p99 = np.percentile(np.array(self._latencies) * 1000, [50, 99])
         return {"p50": float(p50), "p99": float(p99)}
 
+    def video(self) -> SequenceScore | None:
+        """The sequence under the video protocol, fitted once per number of frames."""
+        if self._video[0] != self.frames:
+            self._video = (self.frames, self.scores.scorer.video())
+        return self._video[1]
+
     def results(self) -> dict[str, Any]:
         """What goes into metrics.json: protocols (None without truth), controls, spread."""
         scorer = self.scores.scorer
-        video = scorer.video()
+        video = self.video()
         return {
             "frames": self.frames,
             "image": _means(scorer.image()),
@@ -113,7 +120,7 @@ class SequenceEvaluation:
     def rows(self) -> list[dict[str, Cell]]:
         """One dict of COLUMNS per frame; None where there is no truth."""
         scorer = self.scores.scorer
-        video = scorer.video()
+        video = self.video()
         aligned = [None] * self.frames if video is None else video.frames
         found = []
         for index, frame in enumerate(scorer.frames):
@@ -136,7 +143,7 @@ class SequenceEvaluation:
 
     def draw_strip(self) -> np.ndarray:
         """The strip, aligned as the video protocol does (H x W x 3 uint8 RGB)."""
-        video = self.scores.scorer.video()
+        video = self.video()
         return self.strip.draw(1, 0) if video is None else self.strip.draw(video.scale, video.shift)
 
 

@@ -13,6 +13,7 @@ from dyfn_core.evaluation.pictures import (
     colour_error,
     curves,
     depth_range,
+    draw_cloud,
     encode_picture,
 )
 from dyfn_core.evaluation.report import (
@@ -78,6 +79,21 @@ def test_the_strip_without_truth_has_two_columns() -> None:
     strip = FrameStrip(1, width=80)
     strip.add(0, np.zeros((60, 80, 3), np.uint8), np.ones((60, 80)), None)
     assert strip.draw().shape[1] == 2 * 82
+
+
+def test_a_cloud_is_seen_in_its_colours_with_the_near_point_in_front() -> None:
+    across = np.linspace(-1, 1, 300)
+    wall = np.stack([*np.meshgrid(across, across), np.full((300, 300), 3.0)], -1)
+    red = np.tile(np.array([200, 0, 0], np.uint8), (300, 300, 1))
+    blue = red[..., ::-1]
+    picture = draw_cloud(wall, red)
+    assert (picture == [200, 0, 0]).all(-1).mean() > 0.05
+    assert (picture == 255).all(-1).mean() > 0.2
+    for order in (1, -1):
+        points = np.stack([wall, wall * 1.5][::order])
+        both = draw_cloud(points, np.stack([red, blue][::order]))
+        assert (both[165:195, 225:255] == [200, 0, 0]).all()
+    assert (draw_cloud(wall * np.nan, red) == 255).all()
 
 
 def test_curves_draw_every_panel_and_bear_gaps() -> None:
