@@ -19,6 +19,7 @@ def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--shards", type=int, default=100, help="shards to render")
     parser.add_argument("--views", type=int, default=24, help="independent views in a shard")
     parser.add_argument("--clip-frames", type=int, default=0, help="render clips of this length")
+    parser.add_argument("--clip-fps", type=float, default=5.0, help="frames a second of a clip")
     parser.add_argument("--seed", type=int, default=0, help="first seed; a shard has one each")
     parser.add_argument("--size", default="240x320", help="HEIGHTxWIDTH in pixels")
     return parser.parse_args(argv)
@@ -29,9 +30,16 @@ def main(argv: list[str] | None = None) -> int:
     height, width = (int(x) for x in options.size.split("x"))
     size = (height, width)
     job = Job(
-        options.worlds, options.shards, options.views, options.clip_frames, options.seed, size
+        options.worlds,
+        options.shards,
+        options.views,
+        options.clip_frames,
+        options.seed,
+        size,
+        options.clip_fps,
     )
-    worlds = {"maps": MapWorlds, "rooms": RoomWorlds}[options.worlds](options.assets)
+    kind = MapWorlds if options.worlds == "maps" else RoomWorlds
+    worlds: MapWorlds | RoomWorlds = kind(options.assets)
     with tqdm(total=options.shards, unit="shard", file=sys.stderr) as bar:
 
         def report(line: str) -> None:

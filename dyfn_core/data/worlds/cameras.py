@@ -63,7 +63,7 @@ class FreeSpace:
             floor = self.distance(point[None], np.array([[0, 0, -1.0]]))[0]
             if floor >= FAR / 2:
                 continue
-            lifted = point + [0, 0, rng.uniform(*heights) - floor]
+            lifted = point + np.array([0, 0, rng.uniform(*heights) - floor])
             free = self.sees(point[None], lifted[None])[0]
             if free and self.clearance(lifted[None])[0] > CLEARANCE:
                 return lifted
@@ -132,7 +132,7 @@ def random_path(
 
 
 def _waypoints(space: FreeSpace, rng: np.random.Generator, length: float) -> np.ndarray | None:
-    points = [space.sample_point(rng, (0.6, 1.9))]
+    points = [space.sample_point(rng, (0.5, 1.6))]
     heading, travelled = rng.uniform(0, 2 * np.pi), 0.0
     for _ in range(40):
         heading += rng.normal(0, 0.9)
@@ -188,7 +188,7 @@ def _look_about(
     yaw = rng.uniform(0, 2 * np.pi) * (1 - follow) + follow * along
     yaw = yaw + _smooth_noise(rng, count, knots) * rng.uniform(0.3, 1.2)
     yaw = yaw + _smooth_noise(rng, count, max(3, int(seconds * 4))) * 0.01
-    pitch = np.radians(rng.normal(-10, 8)) + _smooth_noise(rng, count, knots) * np.radians(12)
+    pitch = np.radians(rng.normal(-12, 7)) + _smooth_noise(rng, count, knots) * np.radians(12)
     pitch = np.clip(pitch, np.radians(-65), np.radians(35))
     roll = _smooth_noise(rng, count, knots) * np.radians(3)
     return [

@@ -21,7 +21,6 @@ HELD_OUT_MAPS = frozenset(
     {"aggressor", "oa_bases3plus3", "oacmpdm10", "oa_dm4", "czest1tourney", "pul1ctf"}
 )
 HELD_OUT_SEEDS = 10
-CLIP_FPS = 15.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +28,7 @@ class Job:
     """How much of one kind of world to render, and how.
 
     clip_frames: length of a clip; 0 renders independent views, `views` of them for each shard.
+    clip_fps: frames in a second of the walk; low is far from frame to frame.
     """
 
     worlds: str
@@ -37,6 +37,7 @@ class Job:
     clip_frames: int
     seed: int
     size: tuple[int, int]
+    clip_fps: float = 5.0
 
 
 class MapWorlds:
@@ -76,7 +77,9 @@ class RoomWorlds:
         return furnished_room(rng, self.showroom, self.pool)
 
 
-def render(job: Job, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable[[str], None]) -> None:
+def render(
+    job: Job, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable[[str], None]
+) -> None:
     """Writes the job's shards that are not there yet; one in HELD_OUT_SEEDS is held out."""
     renderer = Renderer(job.size)
     kind = "clip" if job.clip_frames else "frames"
@@ -92,13 +95,13 @@ def render(job: Job, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable
             scene = worlds.scene(rng, held_out)
             photographer = Photographer(renderer, scene, rng)
             if job.clip_frames:
-                views = photographer.clip(job.clip_frames, job.clip_frames / CLIP_FPS)
+                views = photographer.clip(job.clip_frames, job.clip_frames / job.clip_fps)
             else:
                 views = photographer.frames(job.views)
         except (MapError, ValueError) as error:
             report(f"{stem}: skipped, {error}")
             continue
-        if len(views) < max(4, job.views // 4):
+        if not job.clip_frames and len(views) < max(4, job.views // 4):
             report(f"{stem}: skipped, only {len(views)} views of {scene.name} worth keeping")
             continue
         split = "held_out" if held_out else "train"

@@ -83,7 +83,7 @@ class GameFiles:
         return sorted(n for n in self.members if n.startswith("maps/") and n.endswith(".bsp"))
 
     def image(self, name: str) -> np.ndarray | None:
-        """The RGB image of a texture name, whatever suffix it has on disk; None if there is none."""
+        """The RGB image of a texture name, whatever its suffix on disk; None if there is none."""
         stem = re.sub(r"\.(tga|jpg|jpeg|png)$", "", name.lower())
         if stem not in self._images:
             found = next((stem + s for s in IMAGE_SUFFIXES if stem + s in self.members), None)
@@ -149,7 +149,8 @@ def parse_shaders(text: str) -> dict[str, Shader]:
     """Shader script -> {surface name: Shader}; only what decides visibility and image is read."""
     shaders: dict[str, Shader] = {}
     tokens = re.sub(r"//[^\n]*", "", text)
-    name, depth, lines = "", 0, []
+    name, depth = "", 0
+    lines: list[tuple[int, str]] = []
     for line in tokens.replace("{", "\n{\n").replace("}", "\n}\n").splitlines():
         line = line.strip()
         if line == "{":
@@ -185,7 +186,7 @@ def _shader(lines: list[tuple[int, str]]) -> Shader:
         if image is None and source and not source[0].startswith("$"):
             image = source[0]
     globals_ = {w[0]: w[1:] for depth, w in words if depth == 1}
-    editor = (globals_.get("qer_editorimage") or [None])[0]
+    editor = next(iter(globals_.get("qer_editorimage", [])), None)
     hidden = bool(parameters & HIDDEN) or "skyparms" in globals_ or blended
     return Shader(image, editor, hidden)
 

@@ -7,6 +7,7 @@ Runs headless through EGL; Mesa's software rasteriser is enough. Shading: albedo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -47,8 +48,9 @@ in vec3 position; in vec3 normal; in vec2 uv; in vec3 color; in vec2 lightmap_uv
 in float depth; in float emission; flat in int layer; flat in int lightmap;
 layout(location = 0) out vec4 out_color; layout(location = 1) out float out_depth;
 
-float lit_share(int i) {
-    vec4 p = light_matrix[i] * vec4(position, 1.0);
+float lit_share(int i, vec3 n) {
+    // looked up a little off the surface, so that it does not shade itself
+    vec4 p = light_matrix[i] * vec4(position + 0.03 * n, 1.0);
     if (p.w <= 0.0) return 0.0;
     vec3 q = p.xyz / p.w * 0.5 + 0.5;
     if (any(lessThan(q.xy, vec2(0.0))) || any(greaterThan(q.xy, vec2(1.0)))) return 0.0;
@@ -73,10 +75,11 @@ void main() {
         light = ambient * (0.75 + 0.25 * n.z);
         for (int i = 0; i < light_count; i++) {
             vec3 l = light_position[i] - position; float d2 = dot(l, l); l *= inversesqrt(d2);
-            float cone = smoothstep(light_cosine[i], light_cosine[i] + 0.15, -dot(l, light_direction[i]));
+            float aim = -dot(l, light_direction[i]);
+            float cone = smoothstep(light_cosine[i], light_cosine[i] + 0.15, aim);
             float facing = max(dot(n, l), 0.0);
             if (cone * facing <= 0.0) continue;
-            vec3 incoming = light_color[i] * cone * lit_share(i) / (0.5 + d2);
+            vec3 incoming = light_color[i] * cone * lit_share(i, n) / (0.5 + d2);
             light += incoming * facing;
             float h = max(dot(n, normalize(l + to_eye)), 0.0);
             h *= h; h *= h; h *= h; h *= h; h *= h;
@@ -135,14 +138,15 @@ class Renderer:
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
-        self.ctx = moderngl.create_context(standalone=True, backend="egl")
+        self.ctx = moderngl.create_context(standalone=True, **{"backend": "egl"})  # type: ignore[arg-type]
         self.ctx.enable(moderngl.DEPTH_TEST)
-        self.program = self.ctx.program(VERTEX_SHADER, FRAGMENT_SHADER)
-        self.depth_program = self.ctx.program(DEPTH_SHADER, "#version 330\nvoid main() {}")
+        # moderngl types what a program holds as a union; the shaders above say which it is
+        self.program: Any = self.ctx.program(VERTEX_SHADER, FRAGMENT_SHADER)
+        self.depth_program: Any = self.ctx.program(DEPTH_SHADER, "#version 330\nvoid main() {}")
         self.ctx.depth_func = "<="
-        self.shadow_program = self.ctx.program(SHADOW_SHADER, "#version 330\nvoid main() {}")
+        self.shadow_program: Any = self.ctx.program(SHADOW_SHADER, "#version 330\nvoid main() {}")
         shape = (size[1], size[0])
-        self.target = self.ctx.framebuffer(
+        self.target: Any = self.ctx.framebuffer(
             [self.ctx.texture(shape, 4), self.ctx.texture(shape, 1, dtype="f4")],
             self.ctx.depth_renderbuffer(shape),
         )
@@ -165,15 +169,19 @@ class Renderer:
         lightmaps = self._texture_array(scene.lightmaps, LIGHTMAP_SIZE)
         lightmaps.repeat_x = lightmaps.repeat_y = False
         shadows = self._draw_shadows(scene.lights[:MAX_LIGHTS])
-        for unit, (name, texture) in enumerate(
-            [("textures", textures), ("lightmaps", lightmaps), ("shadows", shadows)]
-        ):
+        samplers: list[tuple[str, Any]] = [
+            ("textures", textures),
+            ("lightmaps", lightmaps),
+            ("shadows", shadows),
+        ]
+        for unit, (name, texture) in enumerate(samplers):
             texture.use(unit)
             self.program[name] = unit
         self._set_lights(scene.lights[:MAX_LIGHTS])
         self.program["ambient"] = tuple(scene.ambient.tolist())
         self._scene_objects = [
-            vertices, indices, self.mesh, self.depth_mesh, self.shadow_mesh, textures, lightmaps, shadows
+            vertices, indices, self.mesh, self.depth_mesh, self.shadow_mesh,
+            textures, lightmaps, shadows,
         ]  # fmt: skip
 
     def draw(

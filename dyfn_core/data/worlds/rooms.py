@@ -11,8 +11,11 @@ from dyfn_core.data.worlds import textures
 from dyfn_core.data.worlds.furniture import Piece, Showroom
 from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder
 
-TOPS = re.compile(r"table|desk|cabinet|counter|chest|dresser|drawer|console|nightstand|sideboard|"
-                  r"bookcase|shel|stool|fridge|oven|washer|worktop|buffet", re.IGNORECASE)  # fmt: skip
+TOPS = re.compile(
+    r"table|desk|cabinet|counter|chest|dresser|drawer|console|nightstand|sideboard|bookcase|shel|"
+    r"stool|fridge|oven|washer|worktop|buffet",
+    re.IGNORECASE,
+)
 KINDS: dict[str, tuple[str, ...]] = {
     "living": ("Living room", "Living room", "Lights", "Miscellaneous"),
     "office": ("Office", "Office", "Living room", "Miscellaneous"),
@@ -25,7 +28,7 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 @dataclass
 class Room:
-    """One box of a room while it is being filled. size: (x, y, z) metres, a corner at the origin."""
+    """One box of a room while it is being filled. size: (x, y, z) metres from the origin."""
 
     rng: np.random.Generator
     size: np.ndarray
@@ -103,7 +106,9 @@ def _shell(room: Room, pool: list[np.ndarray]) -> None:
     rng, build, (x, y, z) = room.rng, room.builder, room.size
     floor, ceiling = _surface(room, pool, "floor"), _surface(room, pool, "ceiling")
     repeat = float(rng.uniform(0.5, 2.5))
-    build.quad(np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]]), floor, (x / repeat, y / repeat))
+    build.quad(
+        np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]]), floor, (x / repeat, y / repeat)
+    )
     build.quad(np.array([[0, y, z], [x, y, z], [x, 0, z], [0, 0, z]]), ceiling, (x / 1.2, y / 1.2))
     corners = np.array([[0, 0], [x, 0], [x, y], [0, y]])
     wall = _surface(room, pool, "wall")
@@ -111,9 +116,7 @@ def _shell(room: Room, pool: list[np.ndarray]) -> None:
         a, b = corners[side], corners[(side + 1) % 4]
         layer = _surface(room, pool, "wall") if rng.random() < 0.2 else wall
         length = float(np.linalg.norm(b - a))
-        build.quad(
-            np.array([[*b, 0], [*a, 0], [*a, z], [*b, z]]), layer, (length / 2.0, z / 2.0)
-        )
+        build.quad(np.array([[*b, 0], [*a, 0], [*a, z], [*b, z]]), layer, (length / 2.0, z / 2.0))
         _hang(room, a, b, pool)
 
 
@@ -148,8 +151,8 @@ def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> N
         width, tall = rng.uniform(0.2, min(1.6, 0.8 * length)), rng.uniform(0.2, 1.1)
         low = rng.uniform(0.7, max(height - tall - 0.1, 0.8))
         layer = build.texture(("hung", int(rng.integers(1 << 30))), _image(rng, pool, 0.6))
-        panel(rng.uniform(0, length - width), width, low, low + tall, layer, rng.uniform(0.01, 0.05),
-              rng.choice([0, 0, 0, 1.5]))  # fmt: skip
+        start, off = rng.uniform(0, length - width), rng.uniform(0.01, 0.05)
+        panel(start, width, low, low + tall, layer, off, rng.choice([0, 0, 0, 1.5]))
 
 
 def _partition(room: Room) -> None:
@@ -253,16 +256,20 @@ def _lights(room: Room) -> list[Light]:
     rng, size = room.rng, room.size
     lights = []
     for _ in range(int(rng.integers(1, 4))):
-        position = np.array([*rng.uniform(0.2, 0.8, 2) * size[:2], size[2] - rng.uniform(0.05, 0.4)])
+        position = np.array(
+            [*rng.uniform(0.2, 0.8, 2) * size[:2], size[2] - rng.uniform(0.05, 0.4)]
+        )
         direction = np.array([*rng.normal(0, 0.15, 2), -1.0])
         warm = np.array([1.0, rng.uniform(0.75, 1.0), rng.uniform(0.5, 1.05)])
-        lights.append(Light(position, direction / np.linalg.norm(direction),
-                            warm * rng.uniform(1.5, 7.0), float(rng.uniform(120, 170))))  # fmt: skip
+        color, cone = warm * rng.uniform(1.5, 7.0), float(rng.uniform(120, 170))
+        lights.append(Light(position, direction / np.linalg.norm(direction), color, cone))
     if rng.random() < 0.5:
         side = rng.integers(4)
         edge = [(0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98)][side]
         position = np.array([*np.array(edge) * size[:2], rng.uniform(1.2, 2.2)])
         aim = np.array([*rng.uniform(0.2, 0.8, 2) * size[:2], 0.2]) - position
         color = np.array([0.95, 1.0, 1.1]) * rng.uniform(3, 14)
-        lights.append(Light(position, aim / np.linalg.norm(aim), color, float(rng.uniform(60, 140))))
+        lights.append(
+            Light(position, aim / np.linalg.norm(aim), color, float(rng.uniform(60, 140)))
+        )
     return lights

@@ -80,16 +80,17 @@ class Photographer:
 
         Raises ValueError when no path is found on which most views are worth keeping.
         """
-        for _ in range(6):
+        for _ in range(8):
             lens = Lens.sample(self.rng, self.renderer.size)
             path = random_path(self.space, self.rng, lens, count, seconds)
-            probes = [self.exposure(camera) for camera in path[:: max(1, count // 16)]]
+            every = max(1, count // 16)
+            probes = [self.exposure(camera) for camera in path[::every]]
             good = [e for e in probes if e is not None]
-            if len(good) < 0.9 * len(probes):
+            if len(good) < 0.75 * len(probes):
                 continue
             views, exposure = [], good[0]
-            for camera in path:
-                exposure *= ((self.exposure(camera) or exposure) / exposure) ** 0.25
+            for index, camera in enumerate(path):
+                exposure *= ((probes[index // every] or exposure) / exposure) ** 0.25
                 views.append(View(*self.renderer.draw(camera, exposure, self.gloss), camera))
             return views
         raise ValueError("no camera path worth keeping found")

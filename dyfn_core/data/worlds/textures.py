@@ -53,8 +53,10 @@ def plaster(rng: np.random.Generator) -> np.ndarray:
 
 
 def carpet(rng: np.random.Generator) -> np.ndarray:
-    grain = cv2.GaussianBlur(rng.normal(size=(N, N)).astype(np.float32), (0, 0), rng.uniform(0.5, 2))
-    grain /= grain.std()
+    grain = cv2.GaussianBlur(
+        rng.normal(size=(N, N)).astype(np.float32), (0, 0), rng.uniform(0.5, 2)
+    )
+    grain = grain / grain.std()
     return _shade(muted_color(rng), grain + clouds(rng), rng.uniform(0.05, 0.2))
 
 
