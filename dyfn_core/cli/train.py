@@ -1,13 +1,19 @@
-"""dyfn-train: train the small model's base, or DyFN on top of it."""
+"""dyfn-train: train the small model's base, or DyFN on top of it, and score the result."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
+from dyfn_core.data.rendered import list_shards
+from dyfn_core.data.sequences import clip_frames, folder_frames
+from dyfn_core.evaluation.controls import VariantScore, score_variants, variant_table
+from dyfn_core.models.checkpoints import load_model
 from dyfn_core.training.base import BaseTask
-from dyfn_core.training.config import BaseRunConfig, ConfigError, read_config
+from dyfn_core.training.config import BaseRunConfig, ConfigError, StabilizerRunConfig, read_config
+from dyfn_core.training.stabilizer import StabilizerTask
 from dyfn_core.training.trainer import Trainer, TrainingError
 
 
@@ -15,9 +21,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     options = _parser().parse_args(arguments)
     try:
-        config = read_config(options.config, BaseRunConfig, options.set)
-        trainer = Trainer(BaseTask(config), config, options.out, options.resume)
-        trainer.train(options.max_steps)
+        if options.command == "evaluate":
+            print(variant_table(_evaluate(options)))
+            return 0
+        _trainer(options).train(options.max_steps)
     except (ConfigError, TrainingError, FileNotFoundError, ValueError) as error:
         print(f"dyfn-train: {error}", file=sys.stderr)
         return 1
@@ -27,10 +34,40 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+def _trainer(options: argparse.Namespace) -> Trainer:
+    if options.command == "base":
+        base = read_config(options.config, BaseRunConfig, options.set)
+        return Trainer(BaseTask(base), base, options.out, options.resume)
+    config = read_config(options.config, StabilizerRunConfig, options.set)
+    task = StabilizerTask(config, options.out / "latents")
+    return Trainer(task, config, options.out, options.resume)
+
+
+def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]:
+    model = load_model(options.model)
+    results = {}
+    if options.rendered:
+        shards = list_shards(options.rendered, "clip", "held_out")[: options.clips]
+        if not shards:
+            raise FileNotFoundError(f"no held-out clip under {options.rendered}")
+        clips = [partial(clip_frames, shard, options.stride) for shard in shards]
+        results["held-out clips"] = score_variants(model, clips)
+    for folder in options.recording:
+        frames = partial(folder_frames, folder, options.stride)
+        results[folder.name] = score_variants(model, [frames])
+    if not results:
+        raise ValueError("nothing to evaluate on: give --rendered ROOT and/or --recording FOLDER")
+    return results
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dyfn-train", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    for name, purpose in (("base", "train encoder and head on rendered frames"),):
+    purposes = {
+        "base": "train encoder and head on rendered frames",
+        "stabilizer": "train DyFN on rendered clips, everything else frozen",
+    }
+    for name, purpose in purposes.items():
         command = commands.add_parser(name, help=purpose, description=purpose)
         command.add_argument("config", type=Path, help="YAML file with the run's settings")
         command.add_argument("--out", type=Path, required=True, help="folder of the run")
@@ -39,6 +76,16 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
         )
+    command = commands.add_parser(
+        "evaluate", help="a model and its controls under the image and video protocols"
+    )
+    command.add_argument("model", help="checkpoint or name")
+    command.add_argument("--rendered", type=Path, help="root of rendered folders: held-out clips")
+    command.add_argument("--clips", type=int, default=12, help="at most so many of them")
+    command.add_argument(
+        "--recording", type=Path, action="append", default=[], help="folder with rgb/ and depth/"
+    )
+    command.add_argument("--stride", type=int, default=1, help="every so-many-th frame")
     return parser
 
 

@@ -132,14 +132,15 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
     if look.coarse > 1:
         small = (max(1, round(width / look.coarse)), max(1, round(height / look.coarse)))
         image = cv2.resize(cv2.resize(image, small), (width, height))
-    pixels = image.astype(np.float32) / 255
+    pixels: np.ndarray = image.astype(np.float32) / 255
     if look.light is not None:
         pixels *= cv2.resize(look.light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
     matrix = look.colour * look.gain[:, None]
     pixels = cv2.transform(pixels, np.hstack([matrix, look.offset[:, None]]))
     if look.vignette > 0:
         x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
-        pixels *= (1 - look.vignette * (x[None] ** 2 + y[:, None] ** 2) / 2)[..., None]
+        kept = 1 - look.vignette * (x[None] ** 2 + y[:, None] ** 2) / 2
+        pixels *= kept.astype(np.float32)[..., None]
     if look.blur > 0:
         pixels = cv2.GaussianBlur(pixels, (0, 0), look.blur * width / 256 + 0.2)
     if look.motion is not None:
@@ -156,8 +157,8 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
     result = np.clip(pixels * 255 + 0.5, 0, 255).astype(np.uint8)
     if look.jpeg is not None:
         _, data = cv2.imencode(".jpg", result, [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
-        result = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    return np.asarray(result)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
+    return result
 
 
 def _colour_matrix(hue: float, saturation: float) -> np.ndarray:

@@ -77,8 +77,9 @@ def list_shards(root: Path, kind: str, split: str) -> list[Shard]:
     Raises ValueError on an unknown kind or split, or a meta.json that lacks something.
     """
     if kind not in KINDS or split not in SPLITS:
-        raise ValueError(f"expected a kind of {list(KINDS)} and a split of {SPLITS}, "
-                         f"got {kind!r}, {split!r}")
+        raise ValueError(
+            f"expected a kind of {list(KINDS)} and a split of {SPLITS}, got {kind!r}, {split!r}"
+        )
     metas = sorted((root / KINDS[kind]).glob("*/meta.json"))
     shards = [read_shard(meta.parent) for meta in metas]
     return [shard for shard in shards if shard.split == split and len(shard) > 0]

@@ -15,11 +15,11 @@ from torch import Tensor
 from dyfn_core.geometry.l1_fit import fit_scale_shift
 
 __all__ = [
+    "align_points_scale",
+    "align_points_scale_xyz_shift",
+    "align_points_scale_z_shift",
     "align_scale",
     "align_scale_shift",
-    "align_points_scale",
-    "align_points_scale_z_shift",
-    "align_points_scale_xyz_shift",
     "fit_scale_shift",
 ]
 
@@ -49,7 +49,7 @@ def align_scale(
     rises = (slopes[..., :-1] * place.diff(dim=-1)).cumsum(-1)
     descent = torch.cat([torch.zeros_like(rises[..., :1]), rises], dim=-1)
     descent = torch.where(change > 0, descent, torch.inf)
-    lowest, index = descent.min(dim=-1)
+    index = descent.argmin(dim=-1)
     scale = place.gather(-1, index[..., None])[..., 0]
     scale = torch.where(counts.any(-1), scale, 0.0)
     error = (weight * (scale[..., None] * x - y).abs()).clamp(max=trunc).sum(-1)

@@ -21,7 +21,7 @@ def local_loss(points: Tensor, target: Target, scale: Tensor, alpha: float, ball
 
     points: B x H x W x 3. scale: B, of the whole frames. Aligned by scale and xyz-shift.
     """
-    batch, height, width = target.valid.shape
+    height, width = target.valid.shape[1:]
     diagonal = (height**2 + width**2) ** 0.5
     reach = alpha * diagonal / 2
     weight = target.weight()

@@ -55,7 +55,13 @@ class NormalisedConv(nn.Module):
     scale: Tensor | None
 
     def __init__(
-        self, cin: int, cout: int, kernel: int, stride: int = 1, groups: int = 1, folded: bool = True
+        self,
+        cin: int,
+        cout: int,
+        kernel: int,
+        stride: int = 1,
+        groups: int = 1,
+        folded: bool = True,
     ) -> None:
         super().__init__()
         self.stride, self.groups = stride, groups
@@ -68,7 +74,7 @@ class NormalisedConv(nn.Module):
         self.register_buffer("scale", None if folded else torch.ones(cout))
 
     def forward(self, x: Tensor) -> Tensor:
-        weight = self.weight
+        weight: Tensor = self.weight
         if self.scale is not None:
             weight = weight * self.scale[:, None, None, None]
         if self.border is not None:
@@ -116,9 +122,7 @@ class EfficientNetLite0(nn.Module):
             for repeat in range(stage.repeats):
                 stride = stage.stride if repeat == 0 else 1
                 blocks.append(
-                    Block(
-                        channels, stage.channels, stage.kernel, stride, stage.expansion, folded
-                    )
+                    Block(channels, stage.channels, stage.kernel, stride, stage.expansion, folded)
                 )
                 channels = stage.channels
             if stage.channels in FEATURE_CHANNELS:
@@ -126,7 +130,10 @@ class EfficientNetLite0(nn.Module):
         self.blocks = nn.ModuleList(blocks)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """image: B x 3 x H x W, normalised, H and W multiples of 32 -> features B x C_i x H/s x W/s, s = 8, 16, 32."""
+        """image: B x 3 x H x W, normalised, H and W multiples of 32.
+
+        Returns the features, B x C_i x H/s x W/s for s = 8, 16, 32.
+        """
         tracked = torch.is_grad_enabled()
         with torch.set_grad_enabled(tracked and self.frozen_blocks == 0):
             x = F.relu6(self.stem(image), inplace=True)
@@ -161,7 +168,9 @@ class EfficientNetLite0(nn.Module):
         missing: list[str] = []
         for own, (conv, norm) in wanted.items():
             needed = [f"{conv}.weight"]
-            needed += [f"{norm}.{part}" for part in ("weight", "bias", "running_mean", "running_var")]
+            needed += [
+                f"{norm}.{part}" for part in ("weight", "bias", "running_mean", "running_var")
+            ]
             used.update(needed)
             missing += [key for key in needed if key not in state]
             if all(key in state for key in needed):

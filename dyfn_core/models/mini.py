@@ -37,9 +37,10 @@ class MiniConfig:
     """What decides the shape of a MiniModel.
 
     latent_channels: C of the latent. stage_channels: the decoder's channels at strides 8, 4, ...,
-    one stage each; the outputs come from the last, at twice its resolution. context_channels, context_layers,
-    context_heads: the transformer on the stride-32 map. num_tokens: default budget, in cells of
-    16 x 16 pixels (300 = 320 x 240). folded: the encoder's normalisation is part of its weights.
+    one stage each; the outputs come from the last, at twice its resolution. context_channels,
+    context_layers, context_heads: the transformer on the stride-32 map. num_tokens: default
+    budget, in cells of 16 x 16 pixels (300 = 320 x 240). folded: the encoder's normalisation is
+    part of its weights.
     """
 
     latent_channels: int = 96
@@ -60,7 +61,7 @@ class ResidualBlock(nn.Module):
         self.first = nn.Conv2d(channels, channels, 3, padding=1)
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
         nn.init.normal_(self.second.weight, std=1e-3)
-        nn.init.zeros_(self.second.bias)
+        nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.second(F.relu(self.first(F.relu(self.norm(x)))))

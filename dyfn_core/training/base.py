@@ -93,7 +93,7 @@ class BaseTask(Task):
         return raw, mask, size[1] / size[0]
 
     def validate(self) -> dict[str, float]:
-        """`score` is the error on held-out worlds, or on the training ones where none is held out."""
+        """`score` is the error on held-out worlds, on the training ones where none is held out."""
         if not self.examples:
             self.examples = validation_examples(self.config, self.source)
         scores = {}

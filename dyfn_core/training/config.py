@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 Settings = TypeVar("Settings", bound="RunConfig")
 
@@ -93,6 +93,53 @@ class BaseRunConfig(RunConfig):
     normal_weight: float = Field(0.3, ge=0)
     mask_weight: float = Field(1.0, ge=0)
     balls: tuple[int, int] = (8, 12)
+
+
+class StabilizerRunConfig(RunConfig):
+    """`dyfn-train stabilizer`: DyFN on a frozen base.
+
+    base: a checkpoint of type mini. stabilizer: fields of StabilizerConfig. cache: folder of
+    encoded clips (default: OUT/latents); cache_draws: batches of `stages[0].batch` clips in it;
+    cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
+    length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
+    loss. The four weights: L_align from the first frame and from all, L_temp, and each frame's
+    own error. validation_stride: every so-many-th frame of the recording.
+    """
+
+    base: Path
+    kinds: tuple[str, ...] = ("clip",)
+    stabilizer: dict[str, Any] = Field(default_factory=dict)
+    cache: Path | None = None
+    cache_draws: int = Field(200, ge=1)
+    cache_length: int = Field(32, ge=2)
+    strides: tuple[int, int] = (3, 8)
+    clips: int = Field(4, ge=1)
+    length: int = Field(16, ge=2)
+    decoded: int = Field(8, ge=2)
+    windows: tuple[int, ...] = (1, 2, 4)
+    align_first_weight: float = Field(1.0, ge=0)
+    align_all_weight: float = Field(0.5, ge=0)
+    temporal_weight: float = Field(0.1, ge=0)
+    frame_weight: float = Field(0.2, ge=0)
+    validation_clips: int = Field(8, ge=1)
+    validation_stride: int = Field(4, ge=1)
+
+    @model_validator(mode="after")
+    def _fits(self) -> StabilizerRunConfig:
+        if self.length > self.cache_length:
+            raise ValueError(f"length {self.length} exceeds cache_length {self.cache_length}")
+        if not 1 <= self.strides[0] <= self.strides[1]:
+            raise ValueError(f"strides must rise from 1 or more, got {self.strides}")
+        return self
+
+    def loss_weights(self) -> dict[str, float]:
+        """Weight of each term by its logged name."""
+        return {
+            "align_first": self.align_first_weight,
+            "align_all": self.align_all_weight,
+            "temporal": self.temporal_weight,
+            "frame": self.frame_weight,
+        }
 
 
 def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Settings:

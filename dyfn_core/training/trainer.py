@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import random
 import time
 from abc import ABC, abstractmethod
@@ -202,7 +201,7 @@ class Trainer:
         }
         partial = self.out / (STATE_FILE + ".partial")
         torch.save(state, partial)
-        os.replace(partial, self.out / STATE_FILE)
+        partial.replace(self.out / STATE_FILE)
         with self.ema.applied():
             self._export(self.out / MODEL_FILE)
 
@@ -246,11 +245,12 @@ def picture_rows(batch: ClipBatch, depth: Tensor, count: int = 6) -> np.ndarray:
         image = batch.image[index, 0].permute(1, 2, 0).numpy()
         size = (image.shape[1], image.shape[0])
         true, ours = batch.depth[index, 0].numpy(), depth[index].numpy()
-        columns.append(np.vstack([image, _coloured(true, size), _coloured(ours, size)]))
+        columns.append(np.vstack([image, coloured_depth(true, size), coloured_depth(ours, size)]))
     return np.hstack(columns)
 
 
-def _coloured(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def coloured_depth(depth: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
+    """H x W depth -> RGB, near red, far blue, invalid black; resized to (width, height)."""
     valid = np.isfinite(depth) & (depth > 0)
     near = np.zeros_like(depth)
     near[valid] = 1 / depth[valid]
@@ -258,4 +258,5 @@ def _coloured(depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     scaled = np.clip((near - low) / max(high - low, 1e-9), 0, 1)
     coloured = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO)
     coloured[~valid] = 0
-    return cv2.resize(coloured[..., ::-1], size, interpolation=cv2.INTER_NEAREST)
+    rgb = np.ascontiguousarray(coloured[..., ::-1])
+    return rgb if size is None else cv2.resize(rgb, size, interpolation=cv2.INTER_NEAREST)

@@ -72,3 +72,37 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
         errors.append(np.mean(np.abs(aligned - true) / true))
         shares.append(np.mean(np.maximum(aligned / true, true / aligned) < 1.25))
     return {"abs_rel": float(np.mean(errors)), "delta1": float(np.mean(shares))}
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Consecutive frames, encoded: latent T x C x h x w; depth T x H x W metres."""
+
+    latent: torch.Tensor
+    depth: torch.Tensor
+    image_size: tuple[int, int]
+
+
+def sequence_scores(predicted: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:
+    """AbsRel of a sequence under the image and video protocols (paper section 5).
+
+    predicted, true: per frame, h x w; true depth counts where it is finite and > 1e-3.
+    """
+    pairs = []
+    for ours, depth in zip(predicted, true, strict=True):
+        valid = np.isfinite(depth) & (depth > 1e-3)
+        if valid.sum() >= 16:
+            pairs.append((ours[valid].astype(np.float64), depth[valid].astype(np.float64)))
+    joined = fit_scale_shift(
+        np.concatenate([p for p, _ in pairs]),
+        np.concatenate([d for _, d in pairs]),
+        1 / np.concatenate([d for _, d in pairs]),
+    )
+    return {
+        "image": float(np.mean([_abs_rel(p, d, fit_scale_shift(p, d, 1 / d)) for p, d in pairs])),
+        "video": float(np.mean([_abs_rel(p, d, joined) for p, d in pairs])),
+    }
+
+
+def _abs_rel(ours: np.ndarray, true: np.ndarray, fit: tuple[float, float]) -> float:
+    return float(np.mean(np.abs(np.maximum(fit[0] * ours + fit[1], 1e-3) - true) / true))

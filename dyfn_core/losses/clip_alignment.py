@@ -1,0 +1,78 @@
+"""L_align: the error of a whole clip under one scale and shift (paper section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dyfn_core.geometry.alignment import align_points_scale_z_shift
+from dyfn_core.losses.target import Target
+from dyfn_core.losses.whole_frame import coarse_samples, pick
+
+FIRST_GRID = (10, 12)
+ALL_GRID = (6, 8)
+ANCHORS = 24
+TRUNC = 1.0
+
+
+@dataclass(frozen=True)
+class ClipTarget:
+    """The true geometry of B clips of T frames; `frames` has them all, B * T in that order."""
+
+    frames: Target
+    length: int
+
+    @property
+    def valid(self) -> Tensor:
+        """B x T x H x W bool."""
+        return self.frames.valid.unflatten(0, (-1, self.length))
+
+    @property
+    def points(self) -> Tensor:
+        """B x T x H x W x 3 metres."""
+        return self.frames.points.unflatten(0, (-1, self.length))
+
+    @property
+    def weight(self) -> Tensor:
+        """B x T x H x W: 1 / z where valid, else 0."""
+        return self.frames.weight().unflatten(0, (-1, self.length))
+
+
+def align_clips(points: Tensor, target: ClipTarget, mode: str) -> tuple[Tensor, Tensor]:
+    """One scale (B) and z-shift (B x 3) per clip, detached; scale 0 where nothing can be aligned.
+
+    points: B x T x H x W x 3. mode: "first" fits them to the first frame alone, "all" to samples
+    of every frame. Raises ValueError on another mode.
+    """
+    if mode not in ("first", "all"):
+        raise ValueError(f"alignment mode must be 'first' or 'all', got {mode!r}")
+    frames = 1 if mode == "first" else target.length
+    index = coarse_samples(target.frames, FIRST_GRID if mode == "first" else ALL_GRID)[:1]
+
+    def sample(values: Tensor) -> Tensor:
+        chosen = values[:, :frames].flatten(0, 1)
+        return pick(chosen, index.expand(len(chosen), -1)).unflatten(0, (-1, frames)).flatten(1, 2)
+
+    weight = sample(target.weight)
+    anchors = torch.multinomial(weight + 1e-9, ANCHORS)
+    scale, shift = align_points_scale_z_shift(
+        sample(points.detach()), sample(target.points), weight, TRUNC, anchors
+    )
+    usable = scale > 0
+    return torch.where(usable, scale, 0.0), torch.where(usable[:, None], shift, 0.0)
+
+
+def clip_alignment_loss(points: Tensor, target: ClipTarget, scale: Tensor, shift: Tensor) -> Tensor:
+    """Mean over clips of mean_ji |s p_ji + t - p*_ji|_1 / z*_ji over valid pixels.
+
+    points: B x T x H x W x 3; scale B and shift B x 3 from align_clips. A clip without an
+    alignment, or without a valid pixel, contributes nothing.
+    """
+    aligned = scale[:, None, None, None, None] * points + shift[:, None, None, None, :]
+    error = target.weight * (aligned - target.points).abs().sum(-1)
+    count = target.valid.sum((1, 2, 3))
+    usable = (scale > 0) & (count > 0)
+    per_clip = torch.where(usable, error.sum((1, 2, 3)) / count.clamp(min=1), 0.0)
+    return per_clip.sum() / usable.sum().clamp(min=1)

@@ -1,0 +1,42 @@
+"""L_temp: how much points move from frame to frame, compared in magnitude (paper section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from dyfn_core.losses.clip_alignment import ClipTarget
+
+
+def temporal_loss(
+    points: Tensor, target: ClipTarget, scale: Tensor, pairs: Sequence[tuple[int, int]]
+) -> Tensor:
+    """Mean of | s |p_i - p_j|_1 - |p*_i - p*_j|_1 | / z*_i over pixels valid in both frames.
+
+    points: B x T x H x W x 3; scale: B, of the clips' alignment (clips of scale 0 do not count).
+    pairs: (i, j), the frames to compare; the windows of the paper are j - i in {1, 2, 4}.
+    Without pairs or common pixels the loss is 0.
+    """
+    if not pairs:
+        return points.new_zeros(())
+    first = torch.tensor([pair[0] for pair in pairs], device=points.device)
+    second = torch.tensor([pair[1] for pair in pairs], device=points.device)
+    moved = (points[:, first] - points[:, second]).abs().sum(-1)
+    truly = (target.points[:, first] - target.points[:, second]).abs().sum(-1)
+    both = target.valid[:, first] & target.valid[:, second]
+    both = both & (scale > 0)[:, None, None, None]
+    error = (scale[:, None, None, None] * moved - truly).abs() * target.weight[:, first]
+    return (error * both).sum() / both.sum().clamp(min=1)
+
+
+def window_pairs(frames: Sequence[int], windows: Sequence[int]) -> list[tuple[int, int]]:
+    """Positions (i, j) of frames whose numbers are one of the windows apart."""
+    place = {frame: position for position, frame in enumerate(frames)}
+    return [
+        (position, place[frame + window])
+        for position, frame in enumerate(frames)
+        for window in windows
+        if frame + window in place
+    ]

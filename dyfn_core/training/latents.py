@@ -1,0 +1,138 @@
+"""The frozen-latent cache: augmented clips, encoded once, for training what follows the encoder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import track
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
+from dyfn_core.models.mini import MiniModel
+from dyfn_core.training.config import ConfigError
+
+META = "cache.json"
+
+
+@dataclass(frozen=True)
+class LatentClips:
+    """B clips of T frames: latent B x T x C x h x w and depth B x T x H x W (inf sky, NaN
+    invalid) in float16, normalised intrinsics B x T x 4, image_size (H, W)."""
+
+    latent: Tensor
+    depth: Tensor
+    intrinsics: Tensor
+    image_size: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.latent)
+
+
+@torch.no_grad()
+def encode_clips(model: MiniModel, batch: ClipBatch) -> LatentClips:
+    """Every frame of every clip through the frozen encoder, one clip at a time."""
+    size = (batch.image.shape[-2], batch.image.shape[-1])
+    latents = [model.encode_at(clip.float() / 255, size).features for clip in batch.image]
+    return LatentClips(
+        torch.stack(latents).half().contiguous(), batch.depth.half(), batch.intrinsics, size
+    )
+
+
+class LatentCache:
+    """`draws` batches of encoded clips in a folder, made once and kept in memory.
+
+    The folder says which model and which clip source it was made with; a folder made with others
+    is an error, not a surprise. An interrupted build goes on where it stopped.
+    """
+
+    def __init__(self, folder: Path, model: MiniModel, source: ClipSource, draws: int) -> None:
+        self.folder, self.source, self.draws = folder, source, draws
+        folder.mkdir(parents=True, exist_ok=True)
+        self._check(_fingerprint(model, source))
+        self._build(model)
+        self.entries = [self._load(index) for index in range(draws)]
+
+    def _check(self, wanted: dict[str, Any]) -> None:
+        path = self.folder / META
+        if not path.exists():
+            path.write_text(json.dumps(wanted, indent=1))
+        found = json.loads(path.read_text())
+        other = sorted(key for key in wanted if found.get(key) != wanted[key])
+        if other:
+            raise ConfigError(
+                f"{self.folder} holds latents made with another {', '.join(other)}: "
+                "delete it or give another `cache`"
+            )
+
+    def _build(self, model: MiniModel) -> None:
+        missing = [index for index in range(self.draws) if not self._path(index).exists()]
+        if not missing:
+            return
+        batches = batch_loader(self.source, missing[0])
+        for index in track(range(missing[0], self.draws), description="encoding clips"):
+            clips = encode_clips(model, next(batches))
+            parts = {
+                "latent": clips.latent,
+                "depth": clips.depth,
+                "intrinsics": clips.intrinsics,
+                "image_size": torch.tensor(clips.image_size),
+            }
+            partial = self._path(index).with_suffix(".partial")
+            save_file(parts, partial)
+            partial.replace(self._path(index))
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:05d}.safetensors"
+
+    def _load(self, index: int) -> LatentClips:
+        parts = load_file(self._path(index))
+        height, width = parts["image_size"].tolist()
+        return LatentClips(parts["latent"], parts["depth"], parts["intrinsics"], (height, width))
+
+    def batches(self, start: int, seed: int, clips: int, length: int) -> Iterator[LatentClips]:
+        """Endless random batches of one size: sub-clips of `length`, as they were or reversed."""
+        sizes = sorted({entry.image_size for entry in self.entries})
+        groups = [[e for e in self.entries if e.image_size == size] for size in sizes]
+        counts = torch.tensor([float(sum(map(len, group))) for group in groups])
+        step = start
+        while True:
+            draw = torch.Generator().manual_seed(seed * 1_000_003 + step)
+            group = groups[int(torch.multinomial(counts, 1, generator=draw))]
+            chosen = [_sub_clip(group, length, draw) for _ in range(clips)]
+            latent, depth, intrinsics = (torch.stack(parts) for parts in zip(*chosen, strict=True))
+            yield LatentClips(latent, depth, intrinsics, group[0].image_size)
+            step += 1
+
+
+def _sub_clip(
+    group: list[LatentClips], length: int, draw: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A random run of frames, every one or every second, forwards or backwards."""
+
+    def below(limit: int) -> int:
+        return int(torch.randint(limit, (1,), generator=draw))
+
+    entry = group[below(len(group))]
+    clip, frames = below(len(entry)), entry.latent.shape[1]
+    stride = 1 + below(2 if frames >= 2 * length - 1 else 1)
+    first = below(frames - (length - 1) * stride)
+    index = first + stride * torch.arange(length)
+    if below(2):
+        index = index.flip(0)
+    return entry.latent[clip, index], entry.depth[clip, index], entry.intrinsics[clip, index]
+
+
+def _fingerprint(model: MiniModel, source: ClipSource) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for name, value in model.state_dict().items():
+        if not name.startswith("stabilizer."):
+            digest.update(value.detach().float().contiguous().numpy().tobytes())
+    described = {key: value for key, value in asdict(source).items() if key != "relist_seconds"}
+    return {"model": digest.hexdigest(), "source": json.loads(json.dumps(described, default=str))}
