@@ -3,7 +3,8 @@
     python benchmarks/speed.py [--model dyfn-mini] [--threads 2] [--out speed.json]
 
 Baselines: for the model, MoGe v1 ViT-S (random weights; speed does not depend on them) with the
-same images and the same number of pixels in the network; for the node, the model alone. The node is fed raw frames of the
+same images and the same number of pixels in the network; for the node, the model alone. The node
+is fed raw frames of the
 demo recording over DDS, one at a time, with subscribers on depth and cloud.
 """
 
