@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.pictures import encode_picture
+from dyfn_core.evaluation.pictures import draw_cloud, encode_picture
 from dyfn_core.evaluation.report import Picture, Section, Text, text_table, write_report
 from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, score_table
 from dyfn_ros.environment import prepare_environment
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 RUNS = {"with DyFN": True, "without (base model)": False}
+CLOUD_SIZE = (240, 320)
 DOMAINS = 100  # DDS domains whose ports are below the ephemeral range
 
 
@@ -67,7 +68,15 @@ def default_recording() -> Path:
     return here if here.exists() else Path(__file__).resolve().parents[1] / here
 
 
-def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, SequenceEvaluation]:
+@dataclass(frozen=True)
+class Run:
+    """One pass through the node. clouds: pictures of some of the received clouds, side by side."""
+
+    evaluation: SequenceEvaluation
+    clouds: np.ndarray
+
+
+def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, Run]:
     """Play the recording once per run through one live node and write the report.
 
     Raises RecordingError (the recording), LiveError (the node), ImportError (no ROS).
@@ -105,14 +114,18 @@ def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, S
 
 def _run(
     name: str, stabilize: bool, player: LivePlayer, recording: Recording, limit: int | None
-) -> SequenceEvaluation:
+) -> Run:
     player.reset(stabilize)
     expected = min(recording.expected_frames, limit or recording.expected_frames)
     evaluation = SequenceEvaluation(expected)
+    shown = sorted(evaluation.strip.wanted)[1::2]
+    clouds: list[np.ndarray] = []
     frames = islice(recording.frames(), limit)
     results = player.play(frames)
     for result in tqdm(results, total=expected, desc=name, unit="frame", file=sys.stderr):
         _check_cloud(result.frame, result.depth, result.cloud)
+        if evaluation.frames in shown:
+            clouds.append(draw_cloud(*cloud_arrays(result.cloud), CLOUD_SIZE))
         evaluation.push(
             result.frame.image,
             result.depth,
@@ -121,7 +134,14 @@ def _run(
             stamp=result.frame.stamp_ns / 1e9,
             latency=result.latency,
         )
-    return evaluation
+    return Run(evaluation, np.hstack(clouds) if clouds else np.zeros((1, 1, 3), np.uint8))
+
+
+def cloud_arrays(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """H x W of messages.CLOUD_DTYPE -> points H x W x 3 float32, colours H x W x 3 uint8 RGB."""
+    packed = np.ascontiguousarray(cloud["rgb"]).view(np.uint32)
+    colours = np.stack([packed >> 16, packed >> 8, packed], axis=-1).astype(np.uint8)
+    return np.stack([cloud[axis] for axis in "xyz"], axis=-1), colours
 
 
 def _check_cloud(frame: RecordedFrame, depth: np.ndarray, cloud: np.ndarray) -> None:
@@ -130,30 +150,37 @@ def _check_cloud(frame: RecordedFrame, depth: np.ndarray, cloud: np.ndarray) -> 
         raise LiveError(f"frame {frame.index}: the cloud's z is not the depth image")
 
 
-def _write(options: Options, recording: Recording, runs: dict[str, SequenceEvaluation]) -> None:
-    results = {name: run.results() for name, run in runs.items()}
+def _write(options: Options, recording: Recording, runs: dict[str, Run]) -> None:
+    evaluations = {name: run.evaluation for name, run in runs.items()}
+    results = {name: evaluation.results() for name, evaluation in evaluations.items()}
     out = options.out
     table = score_table(results)
-    strips = {name: run.draw_strip() for name, run in runs.items()}
+    strips = {name: evaluation.draw_strip() for name, evaluation in evaluations.items()}
     sections = [
         Section("Scores", [table, Text(SCORE_NOTE + LATENCY_NOTE, note=True)]),
         *(Section(f"Frames, {name}", [Picture(strips[name], name)]) for name in runs),
+        *(Section(f"Clouds, {name}", [Picture(run.clouds, name)]) for name, run in runs.items()),
     ]
     if all(result["image"] is not None for result in results.values()):
-        curves = curve_picture(runs)
+        curves = curve_picture(evaluations)
         (out / "curves.png").write_bytes(encode_picture(curves))
         sections.insert(1, Section("Over time", [Picture(curves, "scale and error", False)]))
-    for (_, stabilize), strip in zip(RUNS.items(), strips.values(), strict=True):
-        name = "strip_dyfn.png" if stabilize else "strip_base.png"
-        (out / name).write_bytes(encode_picture(strip))
+    for name, stabilize in RUNS.items():
+        kind = "dyfn" if stabilize else "base"
+        (out / f"strip_{kind}.png").write_bytes(encode_picture(strips[name]))
+        (out / f"clouds_{kind}.png").write_bytes(encode_picture(runs[name].clouds))
     notes = [*recording.notes.losses, *recording.notes.warnings]
+    if len({result["output_sha256"] for result in results.values()}) == 1:
+        notes.append(f"{options.model} has no DyFN in it: both runs are the base model's")
     if notes:
         sections.append(Section("Losses and warnings", [Text(note) for note in notes]))
     write_report(out / "report.html", f"{options.model}, live over DDS", sections)
     summary: dict[str, Any] = {"model": options.model, "runs": results}
     (out / "metrics.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     print(text_table(table))
-    frames = next(iter(runs.values())).frames
+    for note in notes:
+        print(f"note: {note}")
+    frames = next(iter(evaluations.values())).frames
     print(f"{frames} frames of {options.recording}, none lost; clouds equal to the depth images")
     print(f"report with pictures: {out / 'report.html'}")
 
@@ -165,7 +192,7 @@ def main(arguments: Sequence[str] | None = None, command: Sequence[str] = NODE_C
     """-> exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     options = parse(arguments)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the node too
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the node too
     try:
         demo(options, command)
     except RecordingError as error:
@@ -184,6 +211,8 @@ def main(arguments: Sequence[str] | None = None, command: Sequence[str] = NODE_C
     except LiveError as error:
         print(f"dyfn-demo: {error}", file=sys.stderr)
         return FAILED
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return OK
 
 
