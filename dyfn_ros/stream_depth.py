@@ -192,9 +192,10 @@ class StreamDepthNode(Node):
         model = self._load(settings.model, device)
 
         self._camera = CameraStream(stream_maker(model))
-        self.get_logger().info(
-            f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
-        )
+        if self.context.ok():  # loading takes long enough to be interrupted
+            self.get_logger().info(
+                f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
+            )
 
     def _work(self, job: Job) -> None:
         """One frame; whatever goes wrong with it, the next one is tried."""
