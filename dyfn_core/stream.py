@@ -192,12 +192,16 @@ class DepthStream:
             self.reset(NEW_SIZE)
         self._camera_size = size
 
-    def _finish(
-        self, affine: AffinePoints, state: StreamState | None, stamp: float | None
+    def finish(
+        self, affine: AffinePoints, state: StreamState | None, stamp: float | None = None
     ) -> Prediction:
-        """Focal, shift and intrinsics of one frame's affine points (batch of one)."""
+        """The half of push after the network: a frame's affine points (batch of one), its state.
+
+        For callers that run the network themselves, on batches or for several streams at once.
+        """
         valid = affine.mask > self.model.mask_threshold
         size = (valid.shape[-2], valid.shape[-1])
+        self._make_room(size)
         samples, usable = sample(affine.points, valid)
         xyz, uv = samples[0][usable[0]], sampled_uv(*size)[usable[0]]
         memory = replace(
@@ -301,7 +305,7 @@ def push_together(
         states: Sequence[StreamState | None]
         states = [None] * len(streams) if state is None else state.unbind()
         return [
-            stream._finish(
+            stream.finish(
                 AffinePoints(affine.points[i : i + 1], affine.mask[i : i + 1]), states[i], stamps[i]
             )
             for i, stream in enumerate(streams)

@@ -25,12 +25,12 @@ from torch import Tensor
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.mini import MiniModel
-from dyfn_core.models.moge import MoGe, MoGeConfig
+from dyfn_core.models.moge import MoGeConfig, MoGeModel
 from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 logger = logging.getLogger(__name__)
 
-MODEL_TYPES: dict[str, type[GeometryModel]] = {"moge": MoGe, "mini": MiniModel}
+MODEL_TYPES: dict[str, type[GeometryModel]] = {"moge": MoGeModel, "mini": MiniModel}
 BUNDLED = {"dyfn-mini": "dyfn-mini.safetensors"}
 HUB_FILES = {"shawlyu/dyfn": "DyFN.pt"}
 HUB_DEFAULT = "model.pt"

@@ -163,7 +163,7 @@ def remap_points(raw: Tensor, remap: str) -> Tensor:
     return torch.cat([xy * z if remap == "exp" else xy.sinh(), z], dim=-1)
 
 
-class MoGe(GeometryModel):
+class MoGeModel(GeometryModel):
     """MoGe v1, with or without DyFN on its latent (paper sections 2 and 3)."""
 
     image_mean: Tensor
@@ -180,7 +180,7 @@ class MoGe(GeometryModel):
         self.register_buffer("image_std", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
 
     @classmethod
-    def from_config(cls, config: dict[str, Any]) -> MoGe:
+    def from_config(cls, config: dict[str, Any]) -> MoGeModel:
         """config: MoGeConfig's fields. ValueError for unknown or bad keys."""
         own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
         return cls(MoGeConfig.from_dict(own))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.moge import MoGe, MoGeConfig
+from dyfn_core.models.moge import MoGeConfig, MoGeModel
 from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 FOV_X = 70.0
@@ -79,7 +79,7 @@ def pinhole_with_dyfn() -> PinholeModel:
 
 
 @pytest.fixture(scope="session")
-def small_moge() -> MoGe:
+def small_moge() -> MoGeModel:
     """A MoGe with random weights and DyFN whose heads do something; not to be changed."""
     torch.manual_seed(0)
     config = MoGeConfig(
@@ -89,7 +89,7 @@ def small_moge() -> MoGe:
         remap_output="exp",
         num_tokens_range=(6, 12),
     )
-    model = MoGe(config)
+    model = MoGeModel(config)
     model.stabilizer = build_stabilizer(32, StabilizerConfig(hidden=8))
     torch.nn.init.normal_(model.stabilizer.gamma_head.weight, std=0.5)
     torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)

@@ -15,17 +15,17 @@ from safetensors.torch import save_file
 import dyfn_core
 from dyfn_core.models import CheckpointError, checkpoints, load_model, save_model
 from dyfn_core.models.mini import MiniModel
-from dyfn_core.models.moge import MoGe
+from dyfn_core.models.moge import MoGeModel
 from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 Official = dict[str, Any]
 
 
 @pytest.fixture
-def official(small_moge: MoGe) -> Official:
+def official(small_moge: MoGeModel) -> Official:
     """small_moge as a released file: official names, fp16 weights, stabilizer of hidden 256."""
     torch.manual_seed(0)
-    model = MoGe(small_moge.architecture)
+    model = MoGeModel(small_moge.architecture)
     model.stabilizer = build_stabilizer(32, StabilizerConfig())
     config = {key: value for key, value in model.config.items() if key != "type"}
     return {
@@ -102,9 +102,9 @@ def test_every_key_that_does_not_fit_is_listed(official: Official, tmp_path: Pat
 
 
 @pytest.mark.parametrize("kind", ["convgru", "gru", None])
-def test_our_format_round_trip(small_moge: MoGe, tmp_path: Path, kind: str | None) -> None:
+def test_our_format_round_trip(small_moge: MoGeModel, tmp_path: Path, kind: str | None) -> None:
     torch.manual_seed(0)
-    model = MoGe(replace(small_moge.architecture, mask_threshold=0.4)).eval()
+    model = MoGeModel(replace(small_moge.architecture, mask_threshold=0.4)).eval()
     if kind:
         settings = StabilizerConfig(kind=kind, hidden=6, pool=2, form="residual")
         model.stabilizer = build_stabilizer(32, settings)
@@ -125,7 +125,7 @@ def test_our_format_round_trip(small_moge: MoGe, tmp_path: Path, kind: str | Non
 
 
 def test_half_precision_file_is_half_the_size_and_loads_as_float32(
-    small_moge: MoGe, tmp_path: Path
+    small_moge: MoGeModel, tmp_path: Path
 ) -> None:
     save_model(small_moge, tmp_path / "full.safetensors")
     save_model(small_moge, tmp_path / "half.safetensors", dtype=torch.float16)
@@ -150,7 +150,7 @@ def test_mini_model_round_trip(tmp_path: Path) -> None:
 
 
 def test_failed_save_leaves_the_old_file(
-    small_moge: MoGe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_moge: MoGeModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(b"old")
@@ -312,7 +312,7 @@ def test_hub_download_is_used_when_there_is_a_network(
     monkeypatch.setenv("DYFN_MODELS", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
     monkeypatch.setattr("huggingface_hub.hf_hub_download", download)
-    assert isinstance(load_model("shawlyu/DyFN"), MoGe)
+    assert isinstance(load_model("shawlyu/DyFN"), MoGeModel)
     assert asked == [("shawlyu/DyFN", "DyFN.pt")]
 
 

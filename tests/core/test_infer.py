@@ -11,7 +11,7 @@ import torch
 from conftest import FOV_X, PinholeModel, picture
 
 from dyfn_core.geometry.camera import fov_from_intrinsics
-from dyfn_core.models.moge import MoGe, resized, whole_patches
+from dyfn_core.models.moge import MoGeModel, resized, whole_patches
 from dyfn_core.prediction import Prediction
 
 
@@ -124,8 +124,8 @@ def test_bad_image_is_refused(
         pinhole.infer(image)
 
 
-def test_stabilizer_off_is_base_model_bit_for_bit(small_moge: MoGe) -> None:
-    base = MoGe(small_moge.architecture).eval()
+def test_stabilizer_off_is_base_model_bit_for_bit(small_moge: MoGeModel) -> None:
+    base = MoGeModel(small_moge.architecture).eval()
     base.load_state_dict(
         {k: v for k, v in small_moge.state_dict().items() if not k.startswith("stabilizer.")}
     )
@@ -138,7 +138,7 @@ def test_stabilizer_off_is_base_model_bit_for_bit(small_moge: MoGe) -> None:
         assert not same(off, small_moge.infer(image))
 
 
-def test_stabilizer_off_runs_nothing_of_it(small_moge: MoGe) -> None:
+def test_stabilizer_off_runs_nothing_of_it(small_moge: MoGeModel) -> None:
     calls = []
     hook = small_moge.stabilizer.register_forward_pre_hook(lambda *_: calls.append(1))
     small_moge.infer(noise(0, 40, 40), stabilize=False)
@@ -148,7 +148,7 @@ def test_stabilizer_off_runs_nothing_of_it(small_moge: MoGe) -> None:
     assert calls
 
 
-def test_state_changes_what_follows_and_is_never_changed(small_moge: MoGe) -> None:
+def test_state_changes_what_follows_and_is_never_changed(small_moge: MoGeModel) -> None:
     first = small_moge.infer(noise(0, 40, 56))
     hidden = first.state.hidden.clone()
     with_state = small_moge.infer(noise(1, 40, 56), first.state)
@@ -159,7 +159,7 @@ def test_state_changes_what_follows_and_is_never_changed(small_moge: MoGe) -> No
 
 
 @pytest.mark.parametrize("size", [(31, 97), (203, 61), (14, 14), (5, 200), (1, 1)])
-def test_odd_sizes_come_out_at_their_size(small_moge: MoGe, size: tuple[int, int]) -> None:
+def test_odd_sizes_come_out_at_their_size(small_moge: MoGeModel, size: tuple[int, int]) -> None:
     prediction = small_moge.infer(noise(0, *size))
     assert prediction.depth.shape == size
     assert prediction.points.shape == (*size, 3)
@@ -167,7 +167,7 @@ def test_odd_sizes_come_out_at_their_size(small_moge: MoGe, size: tuple[int, int
     assert again.depth.shape == size
 
 
-def test_batch_equals_single_images(small_moge: MoGe) -> None:
+def test_batch_equals_single_images(small_moge: MoGeModel) -> None:
     images = np.stack([noise(seed, 45, 70) for seed in range(3)])
     batch = small_moge.infer(images, apply_mask=False)
     second = small_moge.infer(images[::-1].copy(), batch.state, apply_mask=False)

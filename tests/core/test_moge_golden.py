@@ -10,7 +10,7 @@ import torch
 
 from dyfn_core.models import load_model
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.moge import MoGe
+from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction
 
 TOKENS = 300
@@ -97,7 +97,7 @@ def test_latent_and_stabilized_latent_match_over_the_clip(
                 np.testing.assert_allclose(got.numpy(), golden[name][index], atol=1e-3)
 
 
-def test_encoder_layers_match(model: MoGe, golden: Arrays) -> None:
+def test_encoder_layers_match(model: MoGeModel, golden: Arrays) -> None:
     with torch.inference_mode():
         layers = model.backbone(torch.from_numpy(golden["backbone_input_frame0"]), 4)
     for index, layer in enumerate(layers):

@@ -11,7 +11,7 @@ import torch
 from conftest import FOV_X, PinholeModel, picture
 
 from dyfn_core.geometry.camera import normalize_intrinsics
-from dyfn_core.models.moge import MoGe
+from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction, StreamState
 from dyfn_core.stream import DepthStream, RobustMean, Track, push_together
 
@@ -50,7 +50,7 @@ def test_scene_comes_out_as_it_is(pinhole: PinholeModel, camera: np.ndarray | No
         )
 
 
-def test_same_frames_after_reset_give_the_same_bytes(small_moge: MoGe) -> None:
+def test_same_frames_after_reset_give_the_same_bytes(small_moge: MoGeModel) -> None:
     stream = DepthStream(small_moge)
     frames = [noise(seed, 50, 60) for seed in range(4)]
     first = [stream.push(frame) for frame in frames]
@@ -61,14 +61,14 @@ def test_same_frames_after_reset_give_the_same_bytes(small_moge: MoGe) -> None:
     assert stream.resets == {"requested": 1}
 
 
-def test_nothing_looks_ahead(small_moge: MoGe) -> None:
+def test_nothing_looks_ahead(small_moge: MoGeModel) -> None:
     frames = [noise(seed, 50, 60) for seed in range(4)]
     whole, part = DepthStream(small_moge), DepthStream(small_moge)
     early = [whole.push(frame) for frame in frames][:2]
     assert all(equal(a, part.push(f)) for a, f in zip(early, frames[:2], strict=True))
 
 
-def test_stream_carries_the_models_state(small_moge: MoGe) -> None:
+def test_stream_carries_the_models_state(small_moge: MoGeModel) -> None:
     stream, state = DepthStream(small_moge), None
     for seed in range(3):
         prediction = stream.push(noise(seed, 50, 60))
@@ -76,7 +76,7 @@ def test_stream_carries_the_models_state(small_moge: MoGe) -> None:
         assert torch.equal(prediction.state.hidden, state.hidden)
 
 
-def test_stabilizer_off_is_the_base_model_on_every_frame(small_moge: MoGe) -> None:
+def test_stabilizer_off_is_the_base_model_on_every_frame(small_moge: MoGeModel) -> None:
     stream = DepthStream(small_moge, CAMERA, stabilize=False)
     for seed in range(3):
         frame = noise(seed, 48, 64)
@@ -223,7 +223,7 @@ def test_frame_without_a_valid_pixel_keeps_the_camera(pinhole: PinholeModel) -> 
     assert stream.memory.shift.count == 1
 
 
-def test_memory_is_plain_and_restores(small_moge: MoGe) -> None:
+def test_memory_is_plain_and_restores(small_moge: MoGeModel) -> None:
     stream = DepthStream(small_moge)
     stream.push(noise(0, 50, 60), 0.5)
     saved = pickle.dumps(stream.memory)
@@ -234,7 +234,7 @@ def test_memory_is_plain_and_restores(small_moge: MoGe) -> None:
     assert equal(other.push(noise(1, 50, 60)), expected)
 
 
-def test_streams_in_one_batch_equal_streams_alone(small_moge: MoGe) -> None:
+def test_streams_in_one_batch_equal_streams_alone(small_moge: MoGeModel) -> None:
     frames = [[noise(10 * camera + t, 50, 60) for camera in range(2)] for t in range(3)]
     together = [DepthStream(small_moge), DepthStream(small_moge)]
     alone = [DepthStream(small_moge), DepthStream(small_moge)]
