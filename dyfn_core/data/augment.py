@@ -140,7 +140,7 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
     if look.vignette > 0:
         x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)
         kept = 1 - look.vignette * (x[None] ** 2 + y[:, None] ** 2) / 2
-        pixels *= kept.astype(np.float32)[..., None]
+        pixels = pixels * kept.astype(np.float32)[..., None]
     if look.blur > 0:
         pixels = cv2.GaussianBlur(pixels, (0, 0), look.blur * width / 256 + 0.2)
     if look.motion is not None:

@@ -7,7 +7,7 @@ result.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,7 +80,7 @@ FrameSource = Callable[[], Iterable[tuple[np.ndarray, np.ndarray]]]
 
 @torch.inference_mode()
 def score_variants(
-    model: GeometryModel, sequences: list[FrameSource], num_tokens: int | None = None
+    model: GeometryModel, sequences: Sequence[FrameSource], num_tokens: int | None = None
 ) -> dict[str, VariantScore]:
     """Every one of VARIANTS on every sequence ("dyfn" only for a model that has a stabilizer).
 

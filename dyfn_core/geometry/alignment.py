@@ -18,6 +18,7 @@ __all__ = [
     "align_points_scale",
     "align_points_scale_xyz_shift",
     "align_points_scale_z_shift",
+    "align_points_shift",
     "align_scale",
     "align_scale_shift",
     "fit_scale_shift",
@@ -118,6 +119,15 @@ def align_points_scale_xyz_shift(
     """Scale (B) and shift (B x 3) of B x N x 3 points, weights B x N."""
     shifted = torch.tensor([True, True, True], device=points.device)
     return _align_anchored(points, target, weight, trunc, anchors, shifted)
+
+
+def align_points_shift(
+    points: Tensor, target: Tensor, weight: Tensor, trunc: float | None = None
+) -> Tensor:
+    """Shift (B x D) of B x N x D points at scale 1, weights B x N; each axis on its own, exact."""
+    apart = (target - points).transpose(-1, -2)
+    weights = weight[..., None, :].expand_as(apart)
+    return align_scale(torch.ones_like(apart), apart, weights, trunc)[0]
 
 
 @torch.no_grad()

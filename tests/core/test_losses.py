@@ -1,0 +1,191 @@
+"""The terms of the objective: what they ignore, what they see, and that gradients reach them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
+from dyfn_core.losses.local import local_loss
+from dyfn_core.losses.mask import mask_loss
+from dyfn_core.losses.normal import normal_loss
+from dyfn_core.losses.target import Target, target_from_depth
+from dyfn_core.losses.temporal import temporal_loss, window_pairs
+from dyfn_core.losses.whole_frame import whole_frame_loss
+
+INTRINSICS = torch.tensor([0.8, 1.0667, 0.5, 0.5])
+ASPECT = 4 / 3
+
+
+def scene(frames: int = 2, seed: int = 0, size: tuple[int, int] = (24, 32)) -> Target:
+    """Smooth depth of 1 to 6 m, with a strip of sky and a strip of nothing."""
+    torch.manual_seed(seed)
+    coarse = 1 + 5 * torch.rand(frames, 1, 4, 4)
+    depth = torch.nn.functional.interpolate(coarse, size=size, mode="bicubic")[:, 0].clamp(0.5)
+    depth[:, :3] = math.inf
+    depth[:, -2:] = math.nan
+    return target_from_depth(depth, INTRINSICS.expand(frames, -1), ASPECT)
+
+
+def affine(points: Tensor, scale: float, shift: float) -> Tensor:
+    """Points that `scale` and a z-shift of `shift` bring back to `points`."""
+    return (points - torch.tensor([0.0, 0.0, shift])) / scale
+
+
+def test_target_projects_back_onto_its_pixels() -> None:
+    target = scene(1)
+    points = target.points[0, 10, 7]
+    u = 0.8 * points[0] / points[2] + 0.5
+    v = 1.0667 * points[1] / points[2] + 0.5
+    torch.testing.assert_close(torch.stack([u, v]), torch.tensor([7.5 / 32, 10.5 / 24]))
+    assert bool(target.infinite[0, 0, 0])
+    assert not bool(target.valid[0, 0, 0])
+    assert not bool(target.valid[0, -1, 0] | target.infinite[0, -1, 0])
+    focal_pixels = 0.8 * 32
+    torch.testing.assert_close(target.focal[0], torch.tensor(focal_pixels / 40), rtol=1e-3, atol=0)
+
+
+def test_frame_loss_ignores_scale_and_shift_of_each_frame() -> None:
+    target = scene()
+    exact = torch.stack([affine(target.points[0], 2, 0.5), affine(target.points[1], 0.1, -1)])
+    loss, scale = whole_frame_loss(exact, target)
+    torch.testing.assert_close(scale, torch.tensor([2.0, 0.1]))
+    assert float(loss) < 1e-5
+    assert float(whole_frame_loss(exact + 0.2 * torch.rand_like(exact), target)[0]) > 0.02
+
+
+def test_frame_loss_of_a_known_error_is_that_error_over_depth() -> None:
+    """One wrong pixel among many: the alignment stays, the loss is its |error| / z / count."""
+    target = scene(1)
+    wrong = target.points.clone()
+    wrong[0, 12, 12, 0] += 0.3
+    loss, _ = whole_frame_loss(wrong, target)
+    expected = 0.3 / target.points[0, 12, 12, 2] / target.valid.sum()
+    torch.testing.assert_close(loss, expected, rtol=1e-3, atol=0)
+
+
+def test_frame_upside_down_or_empty_counts_nothing_and_breaks_nothing() -> None:
+    target = scene(2)
+    nothing = Target(target.points, torch.zeros_like(target.valid), target.infinite, target.focal)
+    points = target.points.clone().requires_grad_()
+    loss, _ = whole_frame_loss(points, nothing)
+    loss = loss + local_loss(points, nothing, torch.ones(2), 0.25, 4)
+    loss = loss + normal_loss(points, nothing) + mask_loss(points[..., 0], nothing) * 0
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert points.grad is not None
+    assert bool(torch.isfinite(points.grad).all())
+
+
+def test_local_loss_ignores_what_happens_between_the_balls() -> None:
+    """Left and right half at other scales: right locally, wrong as a whole frame."""
+    target = scene(1, size=(48, 64))
+    torn = target.points.clone()
+    torn[:, :, 32:] = affine(torn[:, :, 32:], 2.0, 0.3)
+    torch.manual_seed(0)
+    local = local_loss(torn, target, torch.ones(1), 1 / 4, 64)
+    assert float(local) < 0.5 * float(whole_frame_loss(torn, target)[0])
+    torch.manual_seed(0)
+    assert float(local_loss(target.points, target, torch.ones(1), 1 / 4, 64)) < 1e-5
+
+
+def test_normal_loss_ignores_scale_and_shift_but_not_a_tilt() -> None:
+    target = scene(1)
+    same = normal_loss(affine(target.points, 3.0, 1.0), target)
+    angle = math.radians(20)
+    turn = torch.tensor(
+        [
+            [math.cos(angle), 0, math.sin(angle)],
+            [0, 1, 0],
+            [-math.sin(angle), 0, math.cos(angle)],
+        ]
+    )
+    assert float(same) < float(normal_loss(target.points @ turn.T, target)) / 10
+
+
+def test_mask_loss_counts_sky_and_surfaces_but_not_the_unknown() -> None:
+    target = scene(1)
+    right = target.valid.float()
+    right[:, -2:] = 17.0
+    assert float(mask_loss(right, target)) == 0
+    torch.testing.assert_close(mask_loss(1 - target.valid.float(), target), torch.tensor(1.0))
+
+
+def clip(frames: int = 5, batch: int = 2) -> ClipTarget:
+    return ClipTarget(scene(batch * frames, seed=1), frames)
+
+
+@pytest.mark.parametrize("mode", ["first", "all"])
+def test_clip_alignment_finds_one_scale_and_shift(mode: str) -> None:
+    target = clip()
+    points = affine(target.points, 0.5, 2.0)
+    scale, shift = align_clips(points, target, mode)
+    torch.testing.assert_close(scale, torch.full((2,), 0.5), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(shift[:, 2], torch.full((2,), 2.0), rtol=1e-3, atol=1e-3)
+    assert float(clip_alignment_loss(points, target, scale, shift)) < 1e-3
+
+
+def test_clip_alignment_sees_a_drift_that_frames_alone_do_not() -> None:
+    target = clip()
+    drift = torch.linspace(1, 2, 5)[None, :, None, None, None]
+    points = target.points * drift
+    alone, _ = whole_frame_loss(points.flatten(0, 1), target.frames)
+    scale, shift = align_clips(points, target, "first")
+    together = clip_alignment_loss(points, target, scale, shift)
+    assert float(alone) < 1e-4
+    assert float(together) > 0.3
+
+
+def test_clip_with_nothing_valid_contributes_nothing() -> None:
+    target = clip()
+    valid = target.frames.valid.clone()
+    valid[:5] = False
+    empty = ClipTarget(
+        Target(target.frames.points, valid, target.frames.infinite, target.frames.focal), 5
+    )
+    points = affine(target.points, 0.5, 2.0)
+    scale, shift = align_clips(points, empty, "first")
+    assert float(scale[0]) == 0
+    full = align_clips(points, target, "first")
+    torch.testing.assert_close(
+        clip_alignment_loss(points * 1.1, empty, scale, shift),
+        clip_alignment_loss(
+            points[1:] * 1.1, ClipTarget(scene_part(target, 5), 5), full[0][1:], full[1][1:]
+        ),
+        rtol=1e-2,
+        atol=1e-3,
+    )
+
+
+def scene_part(target: ClipTarget, start: int) -> Target:
+    frames = target.frames
+    return Target(*(getattr(frames, n)[start:] for n in ("points", "valid", "infinite", "focal")))
+
+
+def test_temporal_loss_compares_how_far_points_move() -> None:
+    target = clip()
+    pairs = window_pairs([0, 1, 2, 3, 4], (1, 2, 4))
+    assert len(pairs) == 4 + 3 + 1
+    scale = torch.full((2,), 0.5)
+    assert float(temporal_loss(affine(target.points, 0.5, 2.0), target, scale, pairs)) < 1e-4
+    drift = torch.linspace(1, 2, 5)[None, :, None, None, None]
+    assert float(temporal_loss(affine(target.points, 0.5, 0) * drift, target, scale, pairs)) > 0.1
+
+
+def test_temporal_loss_without_pairs_or_alignment_is_zero() -> None:
+    target = clip()
+    assert float(temporal_loss(target.points, target, torch.ones(2), [])) == 0
+    assert float(temporal_loss(target.points * 2, target, torch.zeros(2), [(0, 1)])) == 0
+
+
+def test_pairs_are_found_among_frames_that_were_chosen() -> None:
+    found = set(window_pairs([0, 3, 4, 5, 9], (1, 2, 4)))
+    assert found == {(0, 2), (1, 2), (1, 3), (2, 3), (3, 4)}
+
+
+def test_unknown_alignment_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="'last'"):
+        align_clips(clip().points, clip(), "last")
