@@ -15,6 +15,7 @@ FIRST_GRID = (10, 12)
 ALL_GRID = (6, 8)
 ANCHORS = 24
 TRUNC = 1.0
+SMALLEST_ERROR = 0.02  # relative errors below this weigh alike in the differentiable fit
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,16 @@ class ClipTarget:
         return self.frames.weight().unflatten(0, (-1, self.length))
 
 
-def align_clips(points: Tensor, target: ClipTarget, mode: str) -> tuple[Tensor, Tensor]:
-    """One scale (B) and z-shift (B x 3) per clip, detached; scale 0 where nothing can be aligned.
+def align_clips(
+    points: Tensor, target: ClipTarget, mode: str, differentiable: bool = False
+) -> tuple[Tensor, Tensor]:
+    """One scale (B) and z-shift (B x 3) per clip; scale 0 where nothing can be aligned.
 
     points: B x T x H x W x 3. mode: "first" fits them to the first frame alone, "all" to samples
-    of every frame. Raises ValueError on another mode.
+    of every frame. differentiable: gradients flow through scale and shift; else, as in the
+    paper, they do not. Detached, the gradient of an error under the first frame's alignment is
+    not that of the error: changing the first frame moves all others. Raises ValueError on
+    another mode.
     """
     if mode not in ("first", "all"):
         raise ValueError(f"alignment mode must be 'first' or 'all', got {mode!r}")
@@ -60,8 +66,36 @@ def align_clips(points: Tensor, target: ClipTarget, mode: str) -> tuple[Tensor, 
     scale, shift = align_points_scale_z_shift(
         sample(points.detach()), sample(target.points), weight, TRUNC, anchors
     )
+    if differentiable:
+        scale, shift = _least_squares(sample(points), sample(target.points), weight, scale, shift)
     usable = scale > 0
     return torch.where(usable, scale, 0.0), torch.where(usable[:, None], shift, 0.0)
+
+
+def _least_squares(
+    points: Tensor, target: Tensor, weight: Tensor, scale: Tensor, shift: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The truncated L1 fit again, as the weighted least squares problem that it solves.
+
+    Weighting every coordinate by its inverse residual makes least squares agree with L1; the
+    weights are constants, the solution is differentiable in the points. B x N x 3 each.
+    """
+    residual = (scale[:, None, None] * points + shift[:, None] - target).detach().abs()
+    error = residual * weight[..., None]
+    trusted = weight[..., None] / residual.clamp(min=1e-9)
+    trusted = torch.minimum(trusted, weight[..., None].square() / SMALLEST_ERROR)
+    trusted = torch.where(error < TRUNC, trusted, 0.0)
+    vz, z, true_z = trusted[..., 2], points[..., 2], target[..., 2]
+    total = vz.sum(1).clamp(min=1e-12)
+    mean_z, mean_true = (vz * z).sum(1) / total, (vz * true_z).sum(1) / total
+    centred = torch.cat([points[..., :2], (z - mean_z[:, None])[..., None]], -1)
+    goal = torch.cat([target[..., :2], (true_z - mean_true[:, None])[..., None]], -1)
+    power = (trusted * centred.square()).sum((1, 2)).clamp(min=1e-12)
+    solved = (trusted * centred * goal).sum((1, 2)) / power
+    usable = scale > 0
+    solved = torch.where(usable, solved, 0.0)
+    zero = torch.zeros_like(solved)
+    return solved, torch.stack([zero, zero, mean_true - solved * mean_z], dim=-1)
 
 
 def clip_alignment_loss(points: Tensor, target: ClipTarget, scale: Tensor, shift: Tensor) -> Tensor:

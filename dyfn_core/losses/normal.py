@@ -14,14 +14,16 @@ SMALLEST, LARGEST = math.radians(1), math.radians(90)
 HUBER = math.radians(3)
 
 
-def normal_loss(points: Tensor, target: Target) -> Tensor:
+def normal_loss(points: Tensor, target: Target, stride: int = 1) -> Tensor:
     """Mean Huber loss of the angles, clamped to 1..90 degrees, over quads of valid neighbours.
 
     points: B x H x W x 3. Normals are cross products of the differences to the right and lower
-    neighbour, which no scale or shift changes.
+    neighbour, which no scale or shift changes. stride: distance of the neighbours in pixels;
+    over one pixel the gradient is mostly the prediction's noise, until that is very small.
     """
-    ours, theirs = _normals(points), _normals(target.points)
-    valid = target.valid[:, :-1, :-1] & target.valid[:, 1:, :-1] & target.valid[:, :-1, 1:]
+    ours, theirs = (_normals(p[:, ::stride, ::stride]) for p in (points, target.points))
+    known = target.valid[:, ::stride, ::stride]
+    valid = known[:, :-1, :-1] & known[:, 1:, :-1] & known[:, :-1, 1:]
     # atan2 keeps a useful gradient at small angles, where acos has none.
     sine = torch.linalg.cross(ours, theirs).square().sum(-1).add(1e-12).sqrt()
     angle = torch.atan2(sine, (ours * theirs).sum(-1)).clamp(SMALLEST, LARGEST)

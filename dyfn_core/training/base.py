@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_shards
+from dyfn_core.losses.canonical_scale import canonical_scale_loss
 from dyfn_core.losses.local import local_loss
 from dyfn_core.losses.mask import mask_loss
 from dyfn_core.losses.normal import normal_loss
@@ -73,17 +74,19 @@ class BaseTask(Task):
             local_loss(points, target, scale, alpha, balls)
             for alpha, balls in zip(LOCAL_LEVELS, self.config.balls, strict=True)
         ]
-        normal, masks = normal_loss(points, target), mask_loss(mask, target)
+        normal = normal_loss(points, target, self.config.normal_stride)
+        masks, canonical = mask_loss(mask, target), canonical_scale_loss(points, target)
         excess = (raw.abs() - LARGEST_RAW).clamp(min=0).square().mean()
         total = (
             frame
             + self.config.local_weight * torch.stack(local).sum()
             + self.config.normal_weight * normal
             + self.config.mask_weight * masks
+            + self.config.scale_weight * canonical
             + excess
         )
-        names = ("loss", "frame", "local_4", "local_16", "normal", "mask", "excess")
-        terms = (total, frame, *local, normal, masks, excess)
+        names = ("loss", "frame", "local_4", "local_16", "normal", "mask", "scale", "excess")
+        terms = (total, frame, *local, normal, masks, canonical, excess)
         return total, {name: float(term.detach()) for name, term in zip(names, terms, strict=True)}
 
     def _forward(self, batch: ClipBatch) -> tuple[Tensor, Tensor, float]:

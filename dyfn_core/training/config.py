@@ -90,8 +90,10 @@ class BaseRunConfig(RunConfig):
     frozen_blocks: int = Field(3, ge=0, le=16)
     frozen_depthwise: bool = True
     local_weight: float = Field(1.0, ge=0)
-    normal_weight: float = Field(0.3, ge=0)
+    normal_weight: float = Field(0.05, ge=0)
+    normal_stride: int = Field(4, ge=1)
     mask_weight: float = Field(1.0, ge=0)
+    scale_weight: float = Field(0.3, ge=0)
     balls: tuple[int, int] = (8, 12)
 
 
@@ -103,7 +105,8 @@ class StabilizerRunConfig(RunConfig):
     cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
     length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
     loss. The four weights: L_align from the first frame and from all, L_temp, and each frame's
-    own error. validation_stride: every so-many-th frame of the recording.
+    own error. align_differentiable: gradients flow through the first frame's alignment (the
+    paper detaches it). validation_stride: every so-many-th frame of the recording.
     """
 
     base: Path
@@ -117,6 +120,7 @@ class StabilizerRunConfig(RunConfig):
     length: int = Field(16, ge=2)
     decoded: int = Field(8, ge=2)
     windows: tuple[int, ...] = (1, 2, 4)
+    align_differentiable: bool = True
     align_first_weight: float = Field(1.0, ge=0)
     align_all_weight: float = Field(0.5, ge=0)
     temporal_weight: float = Field(0.1, ge=0)

@@ -62,7 +62,8 @@ class StabilizerTask(Task):
         terms: dict[str, Tensor] = {}
         first_scale = None
         for mode in ("first", "all"):
-            scale, shift = align_clips(points, target, mode)
+            through = self.config.align_differentiable
+            scale, shift = align_clips(points, target, mode, through and mode == "first")
             terms[f"align_{mode}"] = clip_alignment_loss(points, target, scale, shift)
             first_scale = scale if first_scale is None else first_scale
         pairs = window_pairs(frames, self.config.windows)
