@@ -189,3 +189,40 @@ def test_pairs_are_found_among_frames_that_were_chosen() -> None:
 def test_unknown_alignment_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="'last'"):
         align_clips(clip().points, clip(), "last")
+
+
+def noisy_clip() -> tuple[ClipTarget, Tensor]:
+    target = clip(frames=3, batch=1)
+    torch.manual_seed(3)
+    return target, affine(target.points, 0.5, 2.0) + 0.05 * torch.randn_like(target.points)
+
+
+def test_differentiable_alignment_is_close_to_the_exact_one() -> None:
+    target, points = noisy_clip()
+    for mode in ("first", "all"):
+        torch.manual_seed(0)
+        exact = align_clips(points, target, mode)
+        torch.manual_seed(0)
+        smooth = align_clips(points, target, mode, differentiable=True)
+        torch.testing.assert_close(smooth[0], exact[0], rtol=0.05, atol=0)
+        torch.testing.assert_close(smooth[1][:, 2], exact[1][:, 2], rtol=0.05, atol=0.05)
+
+
+def test_gradient_through_the_first_frame_sees_that_it_moves_all_others() -> None:
+    """Scaling the whole clip changes nothing, scaling the first frame alone does."""
+    target, points = noisy_clip()
+
+    def slope(frames: slice, differentiable: bool) -> float:
+        factor = torch.ones(points.shape[1], requires_grad=True)
+        scaled = points * factor[None, :, None, None, None]
+        torch.manual_seed(0)
+        scale, shift = align_clips(scaled, target, "first", differentiable)
+        clip_alignment_loss(scaled, target, scale, shift).backward()
+        assert factor.grad is not None
+        return float(factor.grad[frames].sum())
+
+    points = points * torch.tensor([1.0, 1.3, 1.4])[None, :, None, None, None]
+    whole, first, others = slice(None), slice(0, 1), slice(1, None)
+    assert abs(slope(whole, True)) < 1e-3
+    assert slope(first, True) < -0.1 < 0.1 < slope(others, True)
+    assert slope(whole, False) > 0.1  # detached, shrinking everything seems to help
