@@ -39,7 +39,7 @@ class MiniConfig:
     latent_channels: C of the latent. stage_channels: the decoder's channels at strides 8, 4, ...,
     one stage each; the outputs come from the last, at twice its resolution. context_channels,
     context_layers, context_heads: the transformer on the stride-32 map. num_tokens: default
-    budget, in cells of 16 x 16 pixels (300 = 320 x 240). folded: the encoder's normalisation is
+    budget, in cells of 16 x 16 pixels (192 = 256 x 192). folded: the encoder's normalisation is
     part of its weights.
     """
 
@@ -48,7 +48,7 @@ class MiniConfig:
     context_channels: int = 192
     context_layers: int = 2
     context_heads: int = 6
-    num_tokens: int = 300
+    num_tokens: int = 192
     folded: bool = True
 
 
