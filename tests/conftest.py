@@ -1,9 +1,11 @@
 """Fixtures that every test may use."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +16,11 @@ def shared_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"{path} is absent: set DYFN_SHARED to the folder of golden files")
     return path
+
+
+@pytest.fixture(autouse=True)
+def same_threads() -> Iterator[None]:
+    """Training sets the process's thread count, and the last bits of a result depend on it."""
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)

@@ -125,6 +125,7 @@ class StabilizerRunConfig(RunConfig):
     align_all_weight: float = Field(0.5, ge=0)
     temporal_weight: float = Field(0.1, ge=0)
     frame_weight: float = Field(0.2, ge=0)
+    spread_weight: float = Field(1.0, ge=0)
     validation_clips: int = Field(8, ge=1)
     validation_stride: int = Field(4, ge=1)
 
@@ -143,6 +144,7 @@ class StabilizerRunConfig(RunConfig):
             "align_all": self.align_all_weight,
             "temporal": self.temporal_weight,
             "frame": self.frame_weight,
+            "spread": self.spread_weight,
         }
 
 

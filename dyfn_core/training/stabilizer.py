@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyfn_core.data.clips import draw_batch, find_shards
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
+from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import target_from_depth
 from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
@@ -70,6 +71,7 @@ class StabilizerTask(Task):
         assert first_scale is not None
         terms["temporal"] = temporal_loss(points, target, first_scale, pairs)
         terms["frame"] = whole_frame_loss(points.flatten(0, 1), truth)[0]
+        terms["spread"] = scale_spread_loss(points, target)
         weights = self.config.loss_weights()
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         values = {name: float(term.detach()) for name, term in terms.items()}

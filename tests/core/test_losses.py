@@ -8,10 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from dyfn_core.losses.canonical_scale import HUBER, canonical_scale_loss
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
 from dyfn_core.losses.local import local_loss
 from dyfn_core.losses.mask import mask_loss
 from dyfn_core.losses.normal import normal_loss
+from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import Target, target_from_depth
 from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
@@ -226,3 +228,36 @@ def test_gradient_through_the_first_frame_sees_that_it_moves_all_others() -> Non
     assert abs(slope(whole, True)) < 1e-3
     assert slope(first, True) < -0.1 < 0.1 < slope(others, True)
     assert slope(whole, False) > 0.1  # detached, shrinking everything seems to help
+
+
+def test_canonical_scale_is_depth_over_focal_and_blind_to_shape() -> None:
+    target = scene()
+    right = target.points / target.focal[:, None, None, None]
+    assert canonical_scale_loss(right, target) == pytest.approx(0.0, abs=1e-9)
+    off = 0.1
+    expected = 0.5 * off**2 / HUBER
+    assert canonical_scale_loss(right * math.exp(off), target) == pytest.approx(expected, rel=1e-3)
+
+
+def test_spread_counts_each_frames_own_scale_and_not_the_clips() -> None:
+    target = ClipTarget(scene(4), 4)
+    points = target.points
+    assert scale_spread_loss(5.0 * points, target) == pytest.approx(0.0, abs=1e-6)
+    factors = torch.tensor([0.0, 0.2, 0.0, 0.2]).exp()[None, :, None, None, None]
+    assert scale_spread_loss(points * factors, target) == pytest.approx(0.1, rel=1e-4)
+
+
+def test_spread_of_a_clip_without_a_valid_pixel_is_zero_with_a_finite_gradient() -> None:
+    empty = target_from_depth(torch.full((3, 8, 8), math.nan), INTRINSICS.expand(3, -1), 1.0)
+    points = torch.ones(1, 3, 8, 8, 3, requires_grad=True)
+    loss = scale_spread_loss(points, ClipTarget(empty, 3))
+    loss.backward()
+    assert float(loss) == 0.0
+    assert points.grad is not None
+    assert torch.isfinite(points.grad).all()
+
+
+def test_normals_over_several_pixels_agree_on_the_truth() -> None:
+    target = scene()
+    best = normal_loss(target.points, target, stride=4)
+    assert best < normal_loss(target.points * torch.tensor([1.0, 1.0, 1.5]), target, stride=4)
