@@ -2,10 +2,9 @@
 
     python benchmarks/speed.py [--model dyfn-mini] [--threads 2] [--out speed.json]
 
-Baselines: for the model, MoGe v1 ViT-S (random weights; speed does not depend on them) with the
-same images and the same number of pixels in the network; for the node, the model alone. The node
-is fed raw frames of the
-demo recording over DDS, one at a time, with subscribers on depth and cloud.
+Baselines: for the model, MoGe v1 ViT-S (random weights; speed does not depend on them) on the
+same images with 392 tokens; for the node, the model alone. The node is fed raw frames of the demo
+recording over DDS, one at a time, with subscribers on depth and cloud.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
 from dyfn_ros.recordings import open_recording
 
 SIZES = {"320x240": (240, 320), "640x480": (480, 640)}
-SAME_PIXELS = 392  # tokens of 14 x 14 pixels that see as many pixels as dyfn-mini's default
+BASELINE_TOKENS = 392  # of 14 x 14 pixels: 320 x 240 in the network
 VITS = {
     "encoder": "dinov2_vits14",
     "intermediate_layers": 4,
@@ -113,7 +112,7 @@ def main() -> None:
         frames = images(options.recording, size, options.frames)
         with tempfile.TemporaryDirectory() as folder:
             rows = {
-                "MoGe v1 ViT-S, base": milliseconds(baseline, frames[:8], False, SAME_PIXELS),
+                "MoGe v1 ViT-S, base": milliseconds(baseline, frames[:8], False, BASELINE_TOKENS),
                 f"{options.model}, base": milliseconds(model, frames, stabilize=False),
                 f"{options.model}, DyFN": milliseconds(model, frames, stabilize=True),
                 f"{options.model}, DyFN, node": node_milliseconds(
