@@ -28,7 +28,7 @@ class Piece:
 
     name: str
     category: str
-    library: Path
+    origin: Path
     model: str
     size: tuple[float, float, float]
     elevation: float
@@ -67,7 +67,7 @@ def _piece(path: Path, entry: dict[str, str]) -> Piece:
     return Piece(
         name=entry.get("name", ""),
         category=entry.get("category", ""),
-        library=path,
+        origin=path,
         model=entry["model"].lstrip("/"),
         size=(width, depth, height),
         elevation=float(entry.get("elevation", "0")) / 100,
@@ -91,7 +91,7 @@ class Showroom:
 
     def parts(self, piece: Piece) -> list[Part]:
         """The model's parts, scaled to the catalogue's size; empty when it cannot be read."""
-        key = (piece.library, piece.model)
+        key = (piece.origin, piece.model)
         if key not in self._parts:
             self._parts[key] = load_parts(piece)
         return self._parts[key]
@@ -130,7 +130,7 @@ class Showroom:
 
 def load_parts(piece: Piece) -> list[Part]:
     """Reads one model; a part is left out when it is mostly transparent."""
-    with zipfile.ZipFile(piece.library) as archive:
+    with zipfile.ZipFile(piece.origin) as archive:
         folder = str(PurePosixPath(piece.model).parent)
         resolver = ZipResolver({n: io.BytesIO(archive.read(n)) for n in archive.namelist()
                                 if n.startswith(folder)}).namespaced(folder)  # fmt: skip
