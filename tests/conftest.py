@@ -1,11 +1,12 @@
 """Fixtures that every test may use."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+
+THREADS = torch.get_num_threads()
 
 
 @pytest.fixture(scope="session")
@@ -19,8 +20,6 @@ def shared_dir() -> Path:
 
 
 @pytest.fixture(autouse=True)
-def same_threads() -> Iterator[None]:
+def same_threads() -> None:
     """Training sets the process's thread count, and the last bits of a result depend on it."""
-    threads = torch.get_num_threads()
-    yield
-    torch.set_num_threads(threads)
+    torch.set_num_threads(THREADS)
