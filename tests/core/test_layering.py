@@ -16,10 +16,12 @@ MAY_IMPORT = {
     "geometry": {"prediction"},
     "models": {"prediction", "geometry"},
     "stream": {"prediction", "geometry", "models"},
+    "metric": {"prediction", "geometry"},
+    "streaming": {"prediction", "geometry", "models", "stream", "metric"},
     "losses": {"prediction", "geometry"},
     "data": {"prediction", "geometry"},
     "training": {"prediction", "geometry", "models", "losses", "data"},
-    "evaluation": {"prediction", "geometry", "models", "stream", "data"},
+    "evaluation": {"prediction", "geometry", "models", "stream", "data", "metric"},
 }
 ROS = {"rclpy", "rosbags", "mcap", "sensor_msgs", "std_msgs", "std_srvs", "geometry_msgs"}
 

@@ -1,0 +1,1 @@
+"""A metric scale for depth that is right up to one scale: fits, references, tracking."""

@@ -1,0 +1,142 @@
+"""The metric scale of one stream, whatever it comes from: one interface over three sources."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dyfn_core.metric.calibration import CalibrationOptions, Calibrator
+from dyfn_core.metric.fit import MetricMap
+from dyfn_core.metric.ground import ground_evidence, up_from_pitch
+from dyfn_core.metric.references import DepthView, Reference
+
+SOURCES = ("none", "fixed", "reference", "camera_height")
+RELATIVE = MetricMap(1.0)
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Where metres come from.
+
+    source: "none" (depth stays relative), "fixed" (metric_scale), "reference" (measurements
+    pushed beside the frames) or "camera_height" (over the ground, metres).
+    metric_scale: metres in one unit of the stream. up: 3, up in the optical frame, for
+    "camera_height"; default a level camera.
+    """
+
+    source: str = "none"
+    metric_scale: float = 1.0
+    camera_height: float = 0.0
+    up: tuple[float, float, float] = field(default_factory=lambda: tuple(up_from_pitch(0.0)))
+    calibration: CalibrationOptions = field(default_factory=CalibrationOptions)
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            raise ValueError(f"source {self.source!r} is unknown, expected one of {SOURCES}")
+        if self.source == "fixed" and not (
+            math.isfinite(self.metric_scale) and self.metric_scale > 0
+        ):
+            raise ValueError(f"metric_scale must be positive, got {self.metric_scale}")
+        if self.source == "camera_height":
+            if not (math.isfinite(self.camera_height) and self.camera_height > 0):
+                raise ValueError(f"camera_height must be positive metres, got {self.camera_height}")
+            length = float(np.linalg.norm(self.up))
+            if len(self.up) != 3 or not math.isfinite(length) or length == 0:
+                raise ValueError(f"up must be a vector of three numbers, got {self.up}")
+
+
+@dataclass(frozen=True)
+class ScaleInForce:
+    """What a frame's depth means.
+
+    source: as in ScaleOptions; map: None while the depth is relative. spread: relative standard
+    deviation of what the scale was found from (0 for a fixed one, NaN unknown).
+    age: seconds since a measurement last agreed with it (0 for a fixed one, NaN unknown).
+    points: pairs behind the last agreeing fit. disagrees: the measurements contradict it.
+    problem: why there is none, or what speaks against it; "" if all is well.
+    """
+
+    source: str
+    map: MetricMap | None = None
+    spread: float = math.nan
+    age: float = math.nan
+    points: int = 0
+    disagrees: bool = False
+    recalibrations: int = 0
+    problem: str = ""
+
+    @property
+    def metric(self) -> bool:
+        return self.map is not None
+
+
+class MetricScale:
+    """The scale of one stream over time.
+
+    A reset of the stream begins a new unit, so it ends a calibration found from measurements;
+    a fixed scale stays, as its user said it.
+    """
+
+    def __init__(self, options: ScaleOptions | None = None) -> None:
+        self.options = options or ScaleOptions()
+        self.calibrator = Calibrator(self.options.calibration)
+
+    def reset(self) -> None:
+        """The stream started anew."""
+        self.calibrator.reset()
+
+    def push(
+        self, view: DepthView, stamp: float, references: Sequence[Reference] = ()
+    ) -> ScaleInForce:
+        """A frame's predicted geometry, and what was measured at its time -> what is in force.
+
+        stamp: seconds. The result already contains this frame's measurements.
+        """
+        if self.options.source == "reference":
+            for reference in references:
+                self.calibrator.push(reference.evidence(view, stamp))
+        elif self.options.source == "camera_height":
+            up = np.array(self.options.up)
+            self.calibrator.push(ground_evidence(view, up, self.options.camera_height, stamp))
+        return self.in_force(stamp)
+
+    def in_force(self, now: float) -> ScaleInForce:
+        """now: seconds, on the clock of the frames' stamps."""
+        source = self.options.source
+        if source == "none":
+            return ScaleInForce(source, problem="no metric source is configured")
+        if source == "fixed":
+            return ScaleInForce(source, MetricMap(self.options.metric_scale), 0.0, 0.0)
+        state = self.calibrator.state
+        if state.map is None:
+            return ScaleInForce(source, problem=state.problem or "no measurement yet")
+        age = math.nan if state.stamp is None else max(now - state.stamp, 0.0)
+        return ScaleInForce(
+            source,
+            state.map,
+            state.spread,
+            age,
+            state.points,
+            state.disagrees,
+            state.recalibrations,
+            state.problem,
+        )
+
+
+def to_metres(
+    points: np.ndarray, depth: np.ndarray, metric_map: MetricMap
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """points H x W x 3, depth H x W -> the same in metres, and where they are before the camera.
+
+    A shift moves every point along its own ray, so that it still projects onto its pixel.
+    """
+    if metric_map.shift == 0:
+        scale = np.float32(metric_map.scale)
+        return points * scale, depth * scale, np.ones(depth.shape, bool)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        metres = metric_map(depth).astype(np.float32)
+        stretched = points * (metres / depth)[..., None]
+    return stretched, metres, metres > 0
