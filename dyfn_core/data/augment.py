@@ -89,6 +89,12 @@ def apply_view(
     return np.ascontiguousarray(image), np.ascontiguousarray(depth), np.array(new, np.float32)
 
 
+def mirrored_pose(pose: np.ndarray) -> np.ndarray:
+    """4 x 4 of the mirrored camera in the mirrored world (x becomes -x in both)."""
+    signs = np.array([-1.0, 1, 1, 1])
+    return pose * signs[:, None] * signs
+
+
 def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
     """A random look; strength 0 changes nothing, 1 is the full range."""
 

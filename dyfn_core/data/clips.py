@@ -1,19 +1,24 @@
-"""Random training batches out of rendered folders: single frames, and clips for DyFN."""
+"""Random training batches out of data sets: single frames, and clips for DyFN."""
 
 from __future__ import annotations
 
+import logging
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from dyfn_core.data.augment import apply_look, apply_view, draw_look, draw_view
-from dyfn_core.data.rendered import Shard, list_shards
+from dyfn_core.data.augment import apply_look, apply_view, draw_look, draw_view, mirrored_pose
+from dyfn_core.data.frames import DataError, FrameError, FrameSequence
+from dyfn_core.data.pool import DataPool, DataSpec, open_pool
+
+MOST_UNREADABLE = 50  # clips in a row that cannot be read end a run
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -29,12 +34,12 @@ class SizeStage:
 class ClipSource:
     """Where clips are drawn from, and how.
 
-    roots: rendered folders. kinds: "frames" and/or "clip". length: frames of a clip, all from one
-    shard; 1 for single frames. strides: smallest and largest step between them. relist_seconds:
-    how often folders that are still growing are listed again.
+    data: the data sets. kinds: of rendered folders, "frames" and/or "clip". length: frames of a
+    clip, all from one sequence; 1 for single frames. strides: smallest and largest step between
+    them. relist_seconds: how often rendered folders that are still growing are listed again.
     """
 
-    roots: tuple[Path, ...]
+    data: tuple[DataSpec, ...]
     kinds: tuple[str, ...]
     length: int
     strides: tuple[int, int]
@@ -47,6 +52,42 @@ class ClipSource:
 
 
 @dataclass(frozen=True)
+class Clip:
+    """T frames of one camera in the order of time (or exactly reversed), equally spaced.
+
+    images: T x H x W x 3 uint8 RGB. depth: T x h x w float32 metres along the optical axis, inf
+    where nothing is hit, NaN where unknown. intrinsics: T x 4 normalised fx, fy, cx, cy. poses:
+    T x 4 x 4 camera to world, optical axes, metres; None unless every frame has one. name: the
+    sequence it is from.
+    """
+
+    images: np.ndarray
+    depth: np.ndarray
+    intrinsics: np.ndarray
+    poses: np.ndarray | None
+    name: str
+
+    @property
+    def valid(self) -> np.ndarray:
+        """T x h x w bool: where the depth is known and finite."""
+        return np.isfinite(self.depth) & (self.depth > 0)
+
+    @property
+    def infinite(self) -> np.ndarray:
+        """T x h x w bool: where nothing is hit (sky)."""
+        return np.isposinf(self.depth)
+
+    def points(self) -> np.ndarray:
+        """T x h x w x 3 float32 metres in each frame's optical axes, NaN where not valid."""
+        height, width = self.depth.shape[1:]
+        depth = np.where(self.valid, self.depth, np.nan)
+        fx, fy, cx, cy = (self.intrinsics[:, k, None, None] for k in range(4))
+        x = ((np.arange(width) + 0.5) / width - cx) / fx
+        y = ((np.arange(height)[:, None] + 0.5) / height - cy) / fy
+        return np.stack([x * depth, y * depth, depth], -1).astype(np.float32)
+
+
+@dataclass(frozen=True)
 class ClipBatch:
     """image: B x T x 3 x H x W uint8. depth: B x T x h x w metres, inf sky, NaN invalid.
     intrinsics: B x T x 4 normalised fx, fy, cx, cy."""
@@ -56,88 +97,130 @@ class ClipBatch:
     intrinsics: Tensor
 
 
-class ClipBatches(IterableDataset[ClipBatch]):
-    """An endless stream of batches; the n-th depends on the seed, n and the folders alone."""
+class ClipBatches(IterableDataset[tuple[ClipBatch, list[str]]]):
+    """An endless stream of batches, each with what was drawn but could not be read.
+
+    The n-th depends on the seed, n and the data alone.
+    """
 
     def __init__(self, source: ClipSource, start: int = 0, split: str = "train") -> None:
         super().__init__()
         self.source, self.start, self.split = source, start, split
 
-    def __iter__(self) -> Iterator[ClipBatch]:
-        index, listed, shards = self.start, -np.inf, []
+    def __iter__(self) -> Iterator[tuple[ClipBatch, list[str]]]:
+        index, listed, pool = self.start, -np.inf, None
         while True:
-            if time.monotonic() - listed > self.source.relist_seconds:
-                shards = find_shards(self.source, self.split)
+            if pool is None or time.monotonic() - listed > self.source.relist_seconds:
+                pool = find_sequences(self.source, self.split)
                 listed = time.monotonic()
-            yield draw_batch(self.source, shards, index)
+            unreadable: list[str] = []
+            yield draw_batch(self.source, pool, index, unreadable), unreadable
             index += 1
 
 
-def find_shards(source: ClipSource, split: str) -> list[Shard]:
-    """Every finished shard that holds a clip. Raises FileNotFoundError when there is none."""
-    span = (source.length - 1) * source.strides[0] + 1
-    shards = [
-        shard
-        for root in source.roots
-        for kind in source.kinds
-        for shard in list_shards(root, kind, split)
-        if len(shard) >= span
-    ]
-    if not shards:
-        raise FileNotFoundError(
-            f"no finished {' or '.join(source.kinds)} folder of split {split!r} with {span} "
-            f"frames or more under {', '.join(str(root) for root in source.roots)}"
+class BatchLoader:
+    """Batches made by one background process; what could not be read is logged and counted.
+
+    unreadable: message -> how often it was drawn.
+    """
+
+    def __init__(self, source: ClipSource, start: int = 0) -> None:
+        find_sequences(source, "train")  # opened here, so that the process inherits it
+        loader = DataLoader(
+            ClipBatches(source, start), batch_size=None, num_workers=1, prefetch_factor=6
         )
-    return shards
+        self._batches = iter(loader)
+        self.unreadable: Counter[str] = Counter()
+
+    def __iter__(self) -> BatchLoader:
+        return self
+
+    def __next__(self) -> ClipBatch:
+        batch: ClipBatch
+        batch, unreadable = next(self._batches)
+        for message in unreadable:
+            if message not in self.unreadable:
+                logger.warning("another clip was drawn instead: %s", message)
+            self.unreadable[message] += 1
+        return batch
 
 
-def batch_loader(source: ClipSource, start: int = 0) -> Iterator[ClipBatch]:
-    """Batches from step `start` on, made by one background process."""
-    loader = DataLoader(
-        ClipBatches(source, start), batch_size=None, num_workers=1, prefetch_factor=6
-    )
-    return iter(loader)
+def find_sequences(source: ClipSource, split: str) -> DataPool:
+    """Every sequence that holds a clip. Raises FileNotFoundError when there is none."""
+    span = (source.length - 1) * source.strides[0] + 1
+    return open_pool(source.data, split, span, source.kinds)
 
 
-def draw_batch(source: ClipSource, shards: list[Shard], index: int) -> ClipBatch:
-    """The batch of step `index`: every clip of it augmented by one draw."""
+def batch_loader(source: ClipSource, start: int = 0) -> BatchLoader:
+    """Batches from step `start` on."""
+    return BatchLoader(source, start)
+
+
+def draw_batch(
+    source: ClipSource, pool: DataPool, index: int, unreadable: list[str] | None = None
+) -> ClipBatch:
+    """The batch of step `index`: every clip of it augmented by one draw.
+
+    A clip that cannot be read is replaced by another; what was wrong is appended to `unreadable`.
+    Raises DataError when MOST_UNREADABLE clips in a row cannot be read.
+    """
     rng = np.random.default_rng([source.seed, index])
     stage = [stage for stage in source.stages if stage.from_step <= index][-1]
     size = stage.sizes[rng.integers(len(stage.sizes))]
-    counts = np.array([len(shard) for shard in shards], np.float64)
-    chosen = rng.choice(len(shards), stage.batch, p=counts / counts.sum())
-    clips = [draw_clip(source, shards[number], size, rng) for number in chosen]
-    image, depth, intrinsics = (np.stack(parts) for parts in zip(*clips, strict=True))
+    chosen = rng.choice(len(pool.sequences), stage.batch, p=pool.shares)
+    unreadable = [] if unreadable is None else unreadable
+    clips = [_readable_clip(source, pool, int(n), size, rng, unreadable) for n in chosen]
     return ClipBatch(
-        torch.from_numpy(image.transpose(0, 1, 4, 2, 3)),
-        torch.from_numpy(depth),
-        torch.from_numpy(intrinsics),
+        torch.from_numpy(np.stack([clip.images for clip in clips]).transpose(0, 1, 4, 2, 3)),
+        torch.from_numpy(np.stack([clip.depth for clip in clips])),
+        torch.from_numpy(np.stack([clip.intrinsics for clip in clips])),
     )
 
 
+def _readable_clip(
+    source: ClipSource,
+    pool: DataPool,
+    number: int,
+    size: tuple[int, int],
+    rng: np.random.Generator,
+    unreadable: list[str],
+) -> Clip:
+    """A clip of sequence `number`; of others drawn in its place while frames are unreadable."""
+    for _ in range(MOST_UNREADABLE):
+        try:
+            return draw_clip(source, pool.sequences[number], size, rng)
+        except FrameError as error:
+            unreadable.append(str(error))
+            number = int(rng.choice(len(pool.sequences), p=pool.shares))
+    raise DataError(f"{MOST_UNREADABLE} clips in a row cannot be read, the last: {unreadable[-1]}")
+
+
 def draw_clip(
-    source: ClipSource, shard: Shard, size: tuple[int, int], rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One augmented clip: T x H x W x 3 uint8, T x h x w float32 depth, T x 4 intrinsics."""
+    source: ClipSource, sequence: FrameSequence, size: tuple[int, int], rng: np.random.Generator
+) -> Clip:
+    """One augmented clip. Raises FrameError when a frame cannot be read."""
     largest = source.strides[1]
     if source.length > 1:
-        largest = min(largest, (len(shard) - 1) // (source.length - 1))
+        largest = min(largest, (len(sequence) - 1) // (source.length - 1))
     stride = int(rng.integers(source.strides[0], largest + 1))
-    first = int(rng.integers(len(shard) - (source.length - 1) * stride))
+    first = int(rng.integers(len(sequence) - (source.length - 1) * stride))
     indices = first + stride * np.arange(source.length)
     if source.length > 1 and rng.random() < 0.5:
         indices = indices[::-1]
     depth_size = (size[0] // source.depth_divisor, size[1] // source.depth_divisor)
     view, look = None, draw_look(rng, source.augment_strength)
-    frames = []
+    frames, poses = [], []
     for number, index in enumerate(indices):
-        image, depth = shard.read(int(index))
+        frame = sequence.read(int(index))
         if view is None:
-            aspect = image.shape[1] / image.shape[0]
+            aspect = frame.image.shape[1] / frame.image.shape[0]
             view = draw_view(rng, aspect, size[1] / size[0], source.smallest_view)
         image, depth, intrinsics = apply_view(
-            image, depth, shard.intrinsics[index], view, size, depth_size
+            frame.image, frame.depth, frame.intrinsics, view, size, depth_size
         )
         frames.append((apply_look(image, look, number), depth, intrinsics))
+        if frame.pose is not None:
+            poses.append(mirrored_pose(frame.pose) if view.flip else frame.pose)
     images, depths, cameras = (np.stack(parts) for parts in zip(*frames, strict=True))
-    return images, depths, cameras
+    placed = np.stack(poses) if len(poses) == len(frames) else None
+    return Clip(images, depths, cameras, placed, sequence.name)

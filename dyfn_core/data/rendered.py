@@ -15,6 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dyfn_core.data.frames import FrameError, RgbdFrame
+
 DEPTH_UNIT = 1000.0  # stored values per metre
 INFINITE = 65535
 KINDS = {"frames": "frames", "clip": "clips"}  # kind -> sub-folder of the root
@@ -39,19 +41,26 @@ class Shard:
     def __len__(self) -> int:
         return len(self.intrinsics)
 
-    def read(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """RGB H x W x 3 uint8 and depth H x W float32 in metres: inf is sky, NaN is invalid.
+    @property
+    def name(self) -> str:
+        """The folder."""
+        return str(self.folder)
 
-        Raises ValueError naming the file when it is absent or damaged.
-        """
+    def read(self, index: int) -> RgbdFrame:
+        """One frame. Raises FrameError naming the file when it is absent or damaged."""
         image = _read(self.folder / f"{index:05d}.jpg", cv2.IMREAD_COLOR)
         stored = _read(self.folder / f"{index:05d}.png", cv2.IMREAD_UNCHANGED)
         if stored.dtype != np.uint16 or stored.shape != image.shape[:2]:
-            raise ValueError(
+            raise FrameError(
                 f"{self.folder}/{index:05d}.png: expected uint16 of {image.shape[:2]}, "
                 f"got {stored.dtype} of {stored.shape}"
             )
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB), decode_depth(stored)
+        return RgbdFrame(
+            cv2.cvtColor(image, cv2.COLOR_BGR2RGB),
+            decode_depth(stored),
+            self.intrinsics[index],
+            None if self.poses is None else self.poses[index],
+        )
 
 
 def decode_depth(stored: np.ndarray) -> np.ndarray:
@@ -106,5 +115,5 @@ def read_shard(folder: Path) -> Shard:
 def _read(path: Path, flags: int) -> np.ndarray:
     image = cv2.imread(str(path), flags)
     if image is None:
-        raise ValueError(f"{path}: no such image, or a damaged one")
+        raise FrameError(f"{path}: no such image, or a damaged one")
     return image

@@ -8,13 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.data.rendered import Shard
+from dyfn_core.data.frames import FrameSequence
 
 
-def clip_frames(shard: Shard, stride: int = 1) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Every `stride`-th frame of a rendered clip: RGB uint8 and depth in metres."""
-    for index in range(0, len(shard), stride):
-        yield shard.read(index)
+def clip_frames(clip: FrameSequence, stride: int = 1) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Every `stride`-th frame of a sequence: RGB uint8 and depth in metres."""
+    for index in range(0, len(clip), stride):
+        frame = clip.read(index)
+        yield frame.image, frame.depth
 
 
 def folder_frames(folder: Path, stride: int = 1) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_shards
+from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_sequences
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
 from dyfn_core.losses.local import local_loss
 from dyfn_core.losses.mask import mask_loss
@@ -22,7 +22,7 @@ from dyfn_core.models.efficientnet import Block, EfficientNetLite0
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
 from dyfn_core.training.trainer import Task, picture_rows
-from dyfn_core.training.validation import Example, recording_examples, score, shard_examples
+from dyfn_core.training.validation import Example, recording_examples, score, spread_examples
 
 LOCAL_LEVELS = (1 / 4, 1 / 16)
 LARGEST_RAW = 4.0  # raw points beyond this are pulled back: the losses do not fix their scale
@@ -31,7 +31,7 @@ LARGEST_RAW = 4.0  # raw points beyond this are pulled back: the losses do not f
 def clip_source(config: RunConfig, length: int, strides: tuple[int, int]) -> ClipSource:
     """Where a run's training clips come from."""
     return ClipSource(
-        roots=config.data,
+        data=tuple(data.spec() for data in config.data),
         kinds=config.kinds,
         length=length,
         strides=strides,
@@ -147,10 +147,10 @@ def freeze_encoder(encoder: EfficientNetLite0, blocks: int, depthwise: bool) -> 
 def validation_examples(config: RunConfig, source: ClipSource) -> dict[str, list[Example]]:
     """Frames to validate on: "rendered", and "recorded" when the config names a recording."""
     try:
-        shards = find_shards(source, "held_out")
+        pool = find_sequences(source, "held_out")
     except FileNotFoundError:
-        shards = find_shards(source, "train")
-    examples = {"rendered": shard_examples(shards, config.validation_frames)}
+        pool = find_sequences(source, "train")
+    examples = {"rendered": spread_examples(pool.sequences, config.validation_frames)}
     if config.validation_rgbd is not None:
         examples["recorded"] = recording_examples(config.validation_rgbd)
     return examples

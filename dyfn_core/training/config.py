@@ -7,7 +7,20 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from dyfn_core.data.datasets import AUTO, RENDERED, data_kind
+from dyfn_core.data.frames import DataError
+from dyfn_core.data.pool import DataSpec
+from dyfn_core.data.rendered import SPLITS
 
 Settings = TypeVar("Settings", bound="RunConfig")
 
@@ -36,15 +49,63 @@ class StageConfig(Strict):
         return sizes
 
 
+class DataConfig(BaseModel):
+    """One data set: root, kind, weight, split and cuts as in DataSpec; other keys are the options
+    of the kind. A path alone stands for its root."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    root: Path
+    kind: str = AUTO
+    weight: float | None = Field(None, gt=0)
+    split: str | None = None
+    cuts: tuple[int | str, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _path_alone(cls, value: Any) -> Any:
+        return {"root": value} if isinstance(value, (str, Path)) else value
+
+    @model_validator(mode="after")
+    def _options_of_kind(self) -> DataConfig:
+        if self.split not in (None, *SPLITS):
+            raise ValueError(f"split must be one of {SPLITS}, got {self.split!r}")
+        try:
+            known = {} if self.kind in (AUTO, RENDERED) else data_kind(self.kind).options()
+        except DataError as error:
+            raise ValueError(str(error)) from error
+        for name, value in (self.model_extra or {}).items():
+            if name not in known:
+                raise ValueError(self._unknown(name, [*known, *type(self).model_fields]))
+            try:
+                self.model_extra[name] = TypeAdapter(known[name][0]).validate_python(value)  # type: ignore[index]
+            except ValidationError as error:
+                raise ValueError(f"{name}: {error.errors()[0]['msg']}, got {value!r}") from error
+        return self
+
+    def _unknown(self, name: str, names: list[str]) -> str:
+        near = difflib.get_close_matches(name, names, n=1)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        if self.kind == AUTO:
+            hint = hint or ", options need the `kind` to be named"
+        return f"unknown key {name!r} of kind {self.kind!r}{hint}"
+
+    def spec(self) -> DataSpec:
+        """As the loaders want it."""
+        options = tuple(sorted((self.model_extra or {}).items()))
+        return DataSpec(self.root, self.kind, self.weight, self.split, self.cuts, options)
+
+
 class RunConfig(Strict):
     """What every run has: data, schedule, bookkeeping.
 
-    data: roots of rendered folders. steps: length of the schedule. hours: the schedule ends no
+    data: roots of data sets, or mappings with their root, kind and weight (DataConfig). kinds: of
+    rendered folders. steps: length of the schedule. hours: the schedule ends no
     later than after so much training time, whatever the step. validation_rgbd: a recording with
     rgb/, depth/ and K.txt to validate on too.
     """
 
-    data: tuple[Path, ...] = Field(min_length=1)
+    data: tuple[DataConfig, ...] = Field(min_length=1)
     kinds: tuple[str, ...] = ("frames", "clip")
     stages: tuple[StageConfig, ...] = Field(min_length=1)
     steps: int = Field(ge=1)

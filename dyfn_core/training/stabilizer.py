@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyfn_core.data.clips import draw_batch, find_shards
+from dyfn_core.data.clips import draw_batch, find_sequences
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import target_from_depth
@@ -125,13 +125,13 @@ class StabilizerTask(Task):
         """The same clips each time: unaugmented, from held-out worlds if there are any."""
         source = replace(self.source, augment_strength=0.0, smallest_view=1.0, seed=VALIDATION_SEED)
         try:
-            shards = find_shards(source, "held_out")
+            found = find_sequences(source, "held_out")
         except FileNotFoundError:
-            shards = find_shards(source, "train")
+            found = find_sequences(source, "train")
         sequences: list[Sequence] = []
         draw = 0
         while len(sequences) < self.config.validation_clips:
-            clips = encode_clips(self.model, draw_batch(source, shards, draw))
+            clips = encode_clips(self.model, draw_batch(source, found, draw))
             sequences += [
                 Sequence(latent, depth, clips.image_size)
                 for latent, depth in zip(clips.latent, clips.depth, strict=True)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import torch
 
-from dyfn_core.data.rendered import Shard
+from dyfn_core.data.frames import FrameSequence
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.models.base import GeometryModel
 
@@ -24,11 +24,12 @@ class Example:
     depth: np.ndarray
 
 
-def shard_examples(shards: list[Shard], count: int) -> list[Example]:
-    """`count` frames, evenly spread over all the frames of the shards."""
-    places = [(shard, index) for shard in shards for index in range(len(shard))]
+def spread_examples(sequences: list[FrameSequence], count: int) -> list[Example]:
+    """`count` frames, evenly spread over all the frames of the sequences."""
+    places = [(sequence, index) for sequence in sequences for index in range(len(sequence))]
     chosen = np.unique(np.linspace(0, len(places) - 1, min(count, len(places))).round().astype(int))
-    return [_small(*places[place][0].read(places[place][1])) for place in chosen]
+    frames = [places[place][0].read(places[place][1]) for place in chosen]
+    return [_small(frame.image, frame.depth) for frame in frames]
 
 
 def recording_examples(folder: Path, every: int = 20) -> list[Example]:

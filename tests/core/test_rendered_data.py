@@ -10,13 +10,14 @@ import pytest
 from made_frames import INTRINSICS, SIZE, made_frame, write_data_set, write_shard
 
 from dyfn_core.data.augment import apply_look, apply_view, draw_look, draw_view
-from dyfn_core.data.clips import ClipSource, SizeStage, draw_batch, find_shards
+from dyfn_core.data.clips import ClipSource, SizeStage, draw_batch, find_sequences
+from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import decode_depth, encode_depth, list_shards, read_shard
 
 
 def source(root: Path, **changes: object) -> ClipSource:
     plain = ClipSource(
-        roots=(root,),
+        data=(DataSpec(root),),
         kinds=("frames", "clip"),
         length=1,
         strides=(1, 1),
@@ -38,7 +39,8 @@ def test_depth_survives_storage_to_half_a_millimetre() -> None:
 def test_shard_reads_what_was_rendered(tmp_path: Path) -> None:
     shard = read_shard(write_shard(tmp_path, "a_0", "frames", "train", 2, seed=5))
     image, depth = made_frame(np.random.default_rng(5))
-    read_image, read_depth = shard.read(0)
+    frame = shard.read(0)
+    read_image, read_depth = frame.image, frame.depth
     assert np.abs(read_image.astype(int) - image).mean() < 15  # red and blue swapped: over 50
     finite = np.isfinite(depth)
     np.testing.assert_allclose(read_depth[finite], depth[finite], atol=6e-4)
@@ -115,13 +117,13 @@ def test_look_is_a_value_and_only_noise_differs_between_frames() -> None:
 
 def test_batch_depends_on_its_number_alone(tmp_path: Path) -> None:
     drawn = source(write_data_set(tmp_path))
-    shards = find_shards(drawn, "train")
-    batch, again = draw_batch(drawn, shards, 3), draw_batch(drawn, shards, 3)
+    pool = find_sequences(drawn, "train")
+    batch, again = draw_batch(drawn, pool, 3), draw_batch(drawn, pool, 3)
     assert batch.image.shape == (3, 1, 3, 64, 96)
     assert batch.depth.shape == (3, 1, 32, 48)
     assert bool((batch.image == again.image).all())
-    assert bool((batch.image != draw_batch(drawn, shards, 4).image).any())
-    assert draw_batch(drawn, shards, 5).image.shape == (2, 1, 3, 96, 64)
+    assert bool((batch.image != draw_batch(drawn, pool, 4).image).any())
+    assert draw_batch(drawn, pool, 5).image.shape == (2, 1, 3, 96, 64)
 
 
 def test_clip_comes_from_one_shard_in_order_with_one_augmentation(tmp_path: Path) -> None:
@@ -131,9 +133,9 @@ def test_clip_comes_from_one_shard_in_order_with_one_augmentation(tmp_path: Path
         (folder / f"{index:05d}.jpg").write_bytes(first[0])
         (folder / f"{index:05d}.png").write_bytes(first[1])
     drawn = source(tmp_path, kinds=("clip",), length=3, strides=(2, 8))
-    shards = find_shards(drawn, "train")
+    pool = find_sequences(drawn, "train")
     for number in range(4):
-        batch = draw_batch(drawn, shards, number)
+        batch = draw_batch(drawn, pool, number)
         same = np.nan_to_num(batch.depth.numpy(), posinf=-1)
         np.testing.assert_array_equal(same, np.repeat(same[:, :1], 3, axis=1))
         difference = batch.image.float().diff(dim=1).abs().mean()
@@ -143,5 +145,5 @@ def test_clip_comes_from_one_shard_in_order_with_one_augmentation(tmp_path: Path
 
 def test_data_without_a_long_enough_clip_is_an_error_that_says_so(tmp_path: Path) -> None:
     drawn = source(write_data_set(tmp_path), kinds=("clip",), length=6, strides=(3, 5))
-    with pytest.raises(FileNotFoundError, match="no finished clip folder of split 'train' with 16"):
-        find_shards(drawn, "train")
+    with pytest.raises(FileNotFoundError, match="no sequence of split 'train' with 16"):
+        find_sequences(drawn, "train")
