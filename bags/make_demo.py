@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.data.worlds.furniture import Showroom
+from dyfn_core.data.worlds.photographer import Photographer
 from dyfn_core.data.worlds.renderer import Renderer
 from dyfn_core.data.worlds.rooms import furnished_room
-from dyfn_core.data.worlds.shards import Photographer, View
+from dyfn_core.data.worlds.shards import View
 from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
 
 LIBRARY = "BlendSwap-CC-0.sh3f"

@@ -1,4 +1,4 @@
-"""Where a camera can be in a scene: single views and smooth collision-free paths."""
+"""Where a camera can be in a scene: ray queries, lenses and single views."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from dyfn_core.data.worlds.scene import Scene
 FAR = 200.0
 CLEARANCE = 0.3
 PROBES = 32
+LENSES = ((38.0, 62.0), (55.0, 82.0), (80.0, 118.0))  # degrees across
 
 
 class FreeSpace:
@@ -98,99 +99,54 @@ class Lens:
     focal: tuple[float, float]
 
     @staticmethod
-    def sample(rng: np.random.Generator, size: tuple[int, int]) -> Lens:
-        """A horizontal field of view between 45 and 100 degrees, most often 55 to 80."""
-        degrees = float(np.clip(rng.normal(66, 11), 45, 100))
+    def of_view(degrees: float, size: tuple[int, int]) -> Lens:
+        """The lens with a horizontal field of view, for images of size (height, width)."""
         fx = 0.5 / np.tan(np.radians(degrees) / 2)
         return Lens((fx, fx * size[1] / size[0]))
 
+    @staticmethod
+    def sample(rng: np.random.Generator, size: tuple[int, int]) -> Lens:
+        """Phones and head-worn cameras (38 to 62 degrees across), webcams and depth cameras (55
+        to 82), wide ones on robots (80 to 118)."""
+        low, high = LENSES[int(rng.choice(len(LENSES), p=[0.4, 0.42, 0.18]))]
+        return Lens.of_view(float(rng.uniform(low, high)), size)
 
-def random_view(space: FreeSpace, rng: np.random.Generator, lens: Lens) -> Camera:
-    """One camera at head or robot height that looks about level, more often down than up."""
+
+def random_view(
+    space: FreeSpace, rng: np.random.Generator, lens: Lens, interests: np.ndarray
+) -> Camera:
+    """One camera at head or robot height that looks about level, more often down than up.
+
+    interests: N x 3; half the time one of them is looked at from 0.6 to 4 m.
+    """
+    if len(interests) and rng.random() < 0.55:
+        camera = _view_of(space, rng, lens, interests[rng.integers(len(interests))])
+        if camera is not None:
+            return camera
     position = space.sample_point(rng, (0.7, 2.0) if rng.random() < 0.8 else (0.25, 0.7))
     pitch = np.radians(np.clip(rng.normal(-10, 13), -65, 35))
     roll = np.radians(rng.normal(0, 4))
     return Camera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
 
 
-def random_path(
-    space: FreeSpace, rng: np.random.Generator, lens: Lens, count: int, seconds: float
-) -> list[Camera]:
-    """`count` cameras along a walk of `seconds`: a spline between free points, looking about.
-
-    Raises ValueError when no collision-free path is found.
-    """
-    for _ in range(30):
-        points = _waypoints(space, rng, length=seconds * rng.uniform(0.3, 1.2))
-        if points is None:
+def _view_of(
+    space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
+) -> Camera | None:
+    """A camera that sees a point from a little above; None when none is found quickly."""
+    for _ in range(12):
+        reach, around = rng.uniform(0.6, 4.0), rng.uniform(0, 2 * np.pi)
+        rise = rng.uniform(1.1, 1.8) - target[2] if rng.random() < 0.8 else rng.uniform(-0.2, 0.6)
+        offset = np.array([reach * np.cos(around), reach * np.sin(around), rise])
+        position = target + offset
+        if not space.sees(position[None], (target + np.array([0, 0, 0.12]))[None])[0]:
             continue
-        positions = _spline(points, count)
-        free = space.clearance(positions) > CLEARANCE / 2
-        if free.all() and space.sees(positions[:-1], positions[1:]).all():
-            return _look_about(positions, rng, lens, seconds)
-    raise ValueError("no collision-free camera path found")
-
-
-def _waypoints(space: FreeSpace, rng: np.random.Generator, length: float) -> np.ndarray | None:
-    points = [space.sample_point(rng, (0.5, 1.6))]
-    heading, travelled = rng.uniform(0, 2 * np.pi), 0.0
-    for _ in range(40):
-        heading += rng.normal(0, 0.9)
-        way = np.array([[np.cos(heading), np.sin(heading), rng.normal(0, 0.08)]])
-        way /= np.linalg.norm(way)
-        room = space.distance(points[-1][None], way)[0] - 2 * CLEARANCE
-        if room < 0.3:
-            heading += rng.uniform(1, 2)
+        if space.clearance(position[None])[0] < CLEARANCE:
             continue
-        step = min(room * rng.uniform(0.4, 0.9), rng.uniform(0.5, 2.5), length - travelled + 0.3)
-        points.append(points[-1] + way[0] * step)
-        travelled += step
-        if travelled >= length:
-            return np.array(points)
+        way = target - position
+        yaw = np.arctan2(way[1], way[0]) + rng.normal(0, 0.2)
+        pitch = np.arctan2(way[2], np.hypot(way[0], way[1])) + rng.normal(0.05, 0.15)
+        pose = pose_at(
+            position, yaw, float(np.clip(pitch, -1.2, 0.6)), np.radians(rng.normal(0, 4))
+        )
+        return Camera(pose, lens.focal)
     return None
-
-
-def _spline(points: np.ndarray, count: int) -> np.ndarray:
-    """Uniform samples of a Catmull-Rom spline through the points, about even in arc length."""
-    padded = np.vstack([2 * points[0] - points[1], points, 2 * points[-1] - points[-2]])
-    t = np.linspace(0, 1, 20, endpoint=False)[:, None]
-    pieces = []
-    for i in range(len(points) - 1):
-        a, b, c, d = padded[i : i + 4]
-        pieces.append(
-            0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2
-                   + (3 * b - 3 * c + d - a) * t**3)
-        )  # fmt: skip
-    dense = np.vstack([*pieces, points[-1:]])
-    arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
-    at = np.linspace(0, arc[-1], count)
-    return np.stack([np.interp(at, arc, dense[:, k]) for k in range(3)], axis=1)
-
-
-def _smooth_noise(rng: np.random.Generator, count: int, knots: int) -> np.ndarray:
-    """A smooth random curve with unit deviation at its knots."""
-    values = rng.normal(size=knots + 3)
-    x = np.linspace(0, knots, count)
-    index = x.astype(int)
-    t = x - index
-    fade = t * t * (3 - 2 * t)
-    return values[index] * (1 - fade) + values[index + 1] * fade
-
-
-def _look_about(
-    positions: np.ndarray, rng: np.random.Generator, lens: Lens, seconds: float
-) -> list[Camera]:
-    count = len(positions)
-    step = np.gradient(positions, axis=0)
-    along = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    follow = rng.choice([0.0, 0.5, 1.0])
-    knots = max(2, int(seconds / 1.5))
-    yaw = rng.uniform(0, 2 * np.pi) * (1 - follow) + follow * along
-    yaw = yaw + _smooth_noise(rng, count, knots) * rng.uniform(0.3, 1.2)
-    yaw = yaw + _smooth_noise(rng, count, max(3, int(seconds * 4))) * 0.01
-    pitch = np.radians(rng.normal(-12, 7)) + _smooth_noise(rng, count, knots) * np.radians(12)
-    pitch = np.clip(pitch, np.radians(-65), np.radians(35))
-    roll = _smooth_noise(rng, count, knots) * np.radians(3)
-    return [
-        Camera(pose_at(positions[i], yaw[i], pitch[i], roll[i]), lens.focal) for i in range(count)
-    ]

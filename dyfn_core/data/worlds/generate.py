@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.data.worlds import vary as variation
+from dyfn_core.data.worlds.casting import Cast
 from dyfn_core.data.worlds.furniture import Showroom
+from dyfn_core.data.worlds.photographer import Photographer
 from dyfn_core.data.worlds.quake import GameFiles, MapError, load_map
 from dyfn_core.data.worlds.renderer import Renderer
 from dyfn_core.data.worlds.rooms import furnished_room
 from dyfn_core.data.worlds.scene import Scene
-from dyfn_core.data.worlds.shards import Photographer, existing_shards, write_shard
+from dyfn_core.data.worlds.shards import existing_shards, write_shard
 
 HELD_OUT_MAPS = frozenset(
     {"aggressor", "oa_bases3plus3", "oacmpdm10", "oa_dm4", "czest1tourney", "pul1ctf"}
@@ -46,6 +48,8 @@ class MapWorlds:
     def __init__(self, assets: Path) -> None:
         self.files = GameFiles(sorted(assets.rglob("*.pk3")))
         self.maps = self.files.maps()
+        libraries = sorted(assets.rglob("*.sh3f"))
+        self.cast = Cast(self.files, Showroom(libraries) if libraries else None)
         self.pool = [
             image
             for name in sorted(self.files.members)
@@ -61,7 +65,9 @@ class MapWorlds:
         if not len(scene.viewpoints):
             raise MapError(f"{name}: no entity stands in free space")
         swap = 0.0 if held_out else float(rng.choice([0.0, 0.0, 0.3, 0.8]))
-        return variation.vary(scene, rng, self.pool, swap)
+        scene = variation.vary(scene, rng, self.pool, swap)
+        self.cast.join(scene, rng)
+        return scene
 
 
 class RoomWorlds:
@@ -71,10 +77,14 @@ class RoomWorlds:
         libraries = sorted(assets.rglob("*.sh3f"))
         self.showroom = Showroom(libraries) if libraries else None
         archives = sorted(assets.rglob("*.pk3"))
-        self.pool = MapWorlds(assets).pool if archives else []
+        maps = MapWorlds(assets) if archives else None
+        self.pool = maps.pool if maps else []
+        self.cast = Cast(maps.files if maps else None, self.showroom)
 
     def scene(self, rng: np.random.Generator, held_out: bool) -> Scene:
-        return furnished_room(rng, self.showroom, self.pool)
+        scene = furnished_room(rng, self.showroom, self.pool)
+        self.cast.join(scene, rng)
+        return scene
 
 
 def render(
@@ -105,6 +115,7 @@ def render(
             report(f"{stem}: skipped, only {len(views)} views of {scene.name} worth keeping")
             continue
         split = "held_out" if held_out else "train"
-        meta = {"world": scene.name, "kind": kind, "split": split, "seed": seed}
+        meta = {"world": scene.name, "kind": kind, "split": split, "seed": seed,
+                "style": photographer.style.record()}  # fmt: skip
         write_shard(root / stem, views, meta)
         report(f"{stem}: {scene.name}, {len(views)} views")

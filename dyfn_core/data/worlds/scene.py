@@ -1,11 +1,15 @@
-"""A static, textured triangle scene in metres: what worlds build and the renderer draws."""
+"""A textured triangle scene in metres: what worlds build and the renderer draws."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+
+if TYPE_CHECKING:
+    from dyfn_core.data.worlds.actors import Actor
 
 TEXTURE_SIZE = 256
 LIGHTMAP_SIZE = 128
@@ -44,6 +48,8 @@ class Scene:
     textures: list of TEXTURE_SIZE x TEXTURE_SIZE x 3 uint8 RGB.
     lightmaps: list of LIGHTMAP_SIZE x LIGHTMAP_SIZE x 3 uint8 RGB (baked light).
     viewpoints: N x 3 positions known to be in free space, from which paths start.
+    actors: what may be placed in it at a moment; their textures are among `textures`.
+    interests: N x 3 points that people look at (table tops, shelves); may be empty.
     """
 
     vertices: np.ndarray
@@ -54,6 +60,8 @@ class Scene:
     ambient: np.ndarray = field(default_factory=lambda: np.full(3, 0.3, np.float32))
     sky: np.ndarray = field(default_factory=lambda: np.full((2, 3), 0.8, np.float32))
     viewpoints: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    actors: list[Actor] = field(default_factory=list)
+    interests: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     name: str = "scene"
 
 
