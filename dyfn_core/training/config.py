@@ -161,7 +161,8 @@ class BaseRunConfig(RunConfig):
 class StabilizerRunConfig(RunConfig):
     """`dyfn-train stabilizer`: DyFN on a frozen base.
 
-    base: a checkpoint of type mini. stabilizer: fields of StabilizerConfig. cache: folder of
+    base: a checkpoint of type mini. stabilizer: fields of StabilizerConfig. warm_start: go on from
+    the base's own DyFN instead of a fresh one. cache: folder of
     encoded clips (default: OUT/latents); cache_draws: batches of `stages[0].batch` clips in it;
     cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
     length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
@@ -173,6 +174,7 @@ class StabilizerRunConfig(RunConfig):
     base: Path
     kinds: tuple[str, ...] = ("clip",)
     stabilizer: dict[str, Any] = Field(default_factory=dict)
+    warm_start: bool = False
     cache: Path | None = None
     cache_draws: int = Field(200, ge=1)
     cache_length: int = Field(32, ge=2)
@@ -194,6 +196,8 @@ class StabilizerRunConfig(RunConfig):
     def _fits(self) -> StabilizerRunConfig:
         if self.length > self.cache_length:
             raise ValueError(f"length {self.length} exceeds cache_length {self.cache_length}")
+        if self.warm_start and self.stabilizer:
+            raise ValueError("warm_start keeps the base's DyFN: remove the `stabilizer` settings")
         if not 1 <= self.strides[0] <= self.strides[1]:
             raise ValueError(f"strides must rise from 1 or more, got {self.strides}")
         return self

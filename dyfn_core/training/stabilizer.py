@@ -176,11 +176,16 @@ def unroll(model: MiniModel, latents: Tensor) -> list[Tensor]:
 
 
 def build_frozen(config: StabilizerRunConfig) -> MiniModel:
-    """The base of a checkpoint, frozen, with a fresh DyFN on it."""
+    """The base of a checkpoint, frozen, with a DyFN on it: a fresh one, or its own (warm_start)."""
     model = load_model(config.base)
     if not isinstance(model, MiniModel):
         raise ConfigError(f"base: {config.base} is no model of type 'mini'")
     model.requires_grad_(False)
+    if config.warm_start:
+        if model.stabilizer is None:
+            raise ConfigError(f"warm_start: {config.base} has no DyFN")
+        model.stabilizer.requires_grad_(True)
+        return model.train()
     torch.manual_seed(config.seed)
     try:
         described = StabilizerConfig(**config.stabilizer)

@@ -83,7 +83,10 @@ def data_kinds() -> dict[str, DataKind | str]:
             kinds[point.name] = point.load()
         except ImportError as error:
             package = point.value.partition(".")[0]
-            kinds[point.name] = f"{package} cannot be imported: {error}"
+            kinds[point.name] = (
+                f"{package} cannot be imported: {error}; "
+                "`pip install rosbags mcap` for ROS recordings"
+            )
     return kinds
 
 

@@ -53,12 +53,14 @@ SEVEN_SCENES_CAMERA: Camera = (585.0, 585.0, 320.0, 240.0)
 @dataclass(frozen=True)
 class Options:
     """intrinsics: instead of the folder's own. depth_scale: stored values per metre instead of
-    the layout's. tolerance, max_gap: seconds, for folders with stamps."""
+    the layout's. tolerance, max_gap: seconds, for folders with stamps. max_missing: frames, for
+    the others."""
 
     intrinsics: Camera | None
     depth_scale: float | None
     tolerance: float
     max_gap: float
+    max_missing: int
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def open_rgbd_folder(
     depth_scale: float | None = None,
     tolerance: float = 0.02,
     max_gap: float = 0.5,
+    max_missing: int = 2,
 ) -> list[FrameSequence]:
     """All folders of a known layout in root and two levels below it.
 
@@ -91,15 +94,16 @@ def open_rgbd_folder(
     depth_scale: other values per metre. intrinsics: fx, fy, cx, cy in pixels of the colour image,
     where the folder has none (TUM has none; the published ones are taken when the path names
     freiburg1, 2, 3 or bonn; 7-Scenes: 585, 585, 320, 240). tolerance: seconds between a colour
-    frame and its depth; max_gap: seconds between frames that are a cut (TUM only: the other
-    layouts have numbers, and a missing number is a cut). Raises DataError without intrinsics.
+    frame and its depth, max_gap: seconds between frames that are a cut (both TUM only).
+    max_missing: more frames than this missing from the numbers are a cut (other layouts).
+    Raises DataError without intrinsics.
     """
-    options = Options(intrinsics, depth_scale, tolerance, max_gap)
+    options = Options(intrinsics, depth_scale, tolerance, max_gap, max_missing)
     sequences: list[FrameSequence] = []
     for folder in folders_holding(root, "rgb.txt", 2):
         views, runs = _tum(folder, options, report)
         for run in runs:
-            sequences += uninterrupted(str(folder), run, partial(_read, views))
+            sequences += uninterrupted(str(folder), run, partial(_read, views), len(views.files))
     for entry, layout in (
         ("frame-*.color.*", _seven_scenes),
         ("color", _scannet),
@@ -110,7 +114,8 @@ def open_rgbd_folder(
                 views = layout(folder, options, report)
                 numbers = sorted(views.files)
                 reader = partial(_read, views)
-                sequences += uninterrupted(str(folder), numbers, reader, step=_usual_step(numbers))
+                largest = _usual_step(numbers) * (1 + max_missing)
+                sequences += uninterrupted(str(folder), numbers, reader, largest)
     return sequences
 
 
