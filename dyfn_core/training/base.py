@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.efficientnet import Block, EfficientNetLite0
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
-from dyfn_core.training.trainer import Task, picture_rows
+from dyfn_core.training.pictures import picture_rows
+from dyfn_core.training.processes import full_precision, part_seed, share_of
+from dyfn_core.training.trainer import Task
 from dyfn_core.training.validation import Example, recording_examples, score, spread_examples
 
 LOCAL_LEVELS = (1 / 4, 1 / 16)
@@ -42,14 +45,24 @@ def clip_source(config: RunConfig, length: int, strides: tuple[int, int]) -> Cli
     )
 
 
+def part_source(source: ClipSource, part: int, parts: int) -> ClipSource:
+    """The same clips in batches of 1 / parts, drawn with the part's own seed."""
+    stages = tuple(
+        replace(stage, batch=share_of(stage.batch, parts, "the batch of a stage"))
+        for stage in source.stages
+    )
+    return replace(source, stages=stages, seed=part_seed(source.seed, part))
+
+
 class BaseTask(Task):
     """The whole of `mini` on frames: whole-frame, local, normal and mask errors."""
 
     model: MiniModel
 
-    def __init__(self, config: BaseRunConfig) -> None:
+    def __init__(self, config: BaseRunConfig, device: torch.device | str = "cpu") -> None:
         self.config = config
-        self.model = build_base(config).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        model = build_base(config).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model = model.to(device)
         self.source = clip_source(config, 1, (1, 1))
         self.examples: dict[str, list[Example]] = {}
 
@@ -62,11 +75,20 @@ class BaseTask(Task):
             {"params": head, "lr": rate},
         ]
 
-    def batches(self, start: int) -> Iterator[ClipBatch]:
-        return batch_loader(self.source, start)
+    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[ClipBatch]:
+        return batch_loader(part_source(self.source, part, parts), start)
+
+    def images(self, batch: ClipBatch) -> int:
+        return len(batch.image)
 
     def loss(self, batch: ClipBatch) -> tuple[Tensor, dict[str, float]]:
         raw, mask, aspect = self._forward(batch)
+        with full_precision(raw):
+            return self._terms(batch, raw.float(), mask.float(), aspect)
+
+    def _terms(
+        self, batch: ClipBatch, raw: Tensor, mask: Tensor, aspect: float
+    ) -> tuple[Tensor, dict[str, float]]:
         target = target_from_depth(batch.depth[:, 0], batch.intrinsics[:, 0], aspect)
         points = remap_exp(raw)
         frame, scale = whole_frame_loss(points, target)
@@ -121,10 +143,7 @@ def build_base(config: BaseRunConfig) -> MiniModel:
         if not isinstance(model, MiniModel):
             raise ConfigError(f"initial: {config.initial} is no model of type 'mini'")
     else:
-        try:
-            model = MiniModel(MiniConfig(**{**config.model, "folded": False}))
-        except TypeError as error:
-            raise ConfigError(f"model: {error}; the fields are those of MiniConfig") from error
+        model = MiniModel(MiniConfig(**{**config.model, "folded": False}))
         model.load_imagenet_encoder()
     freeze_encoder(model.encoder, config.frozen_blocks, config.frozen_depthwise)
     return model.train()

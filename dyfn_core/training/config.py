@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import (
@@ -21,6 +21,9 @@ from dyfn_core.data.datasets import AUTO, RENDERED, data_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
+from dyfn_core.models.mini import MiniConfig
+from dyfn_core.models.stabilizer import StabilizerConfig
+from dyfn_core.training.config_errors import check_fields, describe
 
 Settings = TypeVar("Settings", bound="RunConfig")
 
@@ -102,7 +105,10 @@ class RunConfig(Strict):
     data: roots of data sets, or mappings with their root, kind and weight (DataConfig). kinds: of
     rendered folders. steps: length of the schedule. hours: the schedule ends no
     later than after so much training time, whatever the step. validation_rgbd: a recording with
-    rgb/, depth/ and K.txt to validate on too.
+    rgb/, depth/ and K.txt to validate on too. device: "auto" takes the GPU that accelerate gives
+    this process, if any. mixed_precision: of the network; losses are always float32. parts: a
+    batch is computed in so many equal parts, shared out among the processes (default: one each).
+    most_bad_steps: so many in a row may be skipped for a loss or gradient that is not finite.
     """
 
     data: tuple[DataConfig, ...] = Field(min_length=1)
@@ -112,6 +118,9 @@ class RunConfig(Strict):
     hours: float | None = Field(None, gt=0)
     seed: int = 0
     threads: int = Field(2, ge=1)
+    device: Literal["auto", "cpu"] = "auto"
+    mixed_precision: Literal["no", "bf16", "fp16"] = "no"
+    parts: int | None = Field(None, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
     weight_decay: float = Field(0.01, ge=0)
     warmup_steps: int = Field(200, ge=0)
@@ -157,6 +166,11 @@ class BaseRunConfig(RunConfig):
     scale_weight: float = Field(0.3, ge=0)
     balls: tuple[int, int] = (8, 12)
 
+    @field_validator("model")
+    @classmethod
+    def _describes_a_model(cls, value: dict[str, Any]) -> dict[str, Any]:
+        return check_fields(value, MiniConfig)
+
 
 class StabilizerRunConfig(RunConfig):
     """`dyfn-train stabilizer`: DyFN on a frozen base.
@@ -191,6 +205,11 @@ class StabilizerRunConfig(RunConfig):
     spread_weight: float = Field(1.0, ge=0)
     validation_clips: int = Field(8, ge=1)
     validation_stride: int = Field(4, ge=1)
+
+    @field_validator("stabilizer")
+    @classmethod
+    def _describes_a_stabilizer(cls, value: dict[str, Any]) -> dict[str, Any]:
+        return check_fields(value, StabilizerConfig)
 
     @model_validator(mode="after")
     def _fits(self) -> StabilizerRunConfig:
@@ -231,7 +250,7 @@ def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Setti
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        problems = "\n  ".join(_describe(problem, kind) for problem in error.errors())
+        problems = "\n  ".join(describe(error, kind))
         raise ConfigError(f"{path}:\n  {problems}") from error
 
 
@@ -245,14 +264,3 @@ def _override(values: dict[str, Any], override: str) -> None:
         if not isinstance(values, dict):
             raise ConfigError(f"--set {override!r}: {parent} holds no settings of its own")
     values[last] = yaml.safe_load(text)
-
-
-def _describe(problem: Any, kind: type[RunConfig]) -> str:
-    where = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(problem["loc"][-1]), kind.model_fields, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else ""
-        return f"unknown key {where!r}{hint}"
-    if problem["type"] == "missing":
-        return f"key {where!r} is missing"
-    return f"{where}: {problem['msg']} (got {problem['input']!r})"

@@ -39,9 +39,13 @@ class LatentClips:
 def encode_clips(model: MiniModel, batch: ClipBatch) -> LatentClips:
     """Every frame of every clip through the frozen encoder, one clip at a time."""
     size = (batch.image.shape[-2], batch.image.shape[-1])
-    latents = [model.encode_at(clip.float() / 255, size).features for clip in batch.image]
+    device = model.device
+    latents = [
+        model.encode_at(clip.to(device).float() / 255, size).features.half().cpu()
+        for clip in batch.image
+    ]
     return LatentClips(
-        torch.stack(latents).half().contiguous(), batch.depth.half(), batch.intrinsics, size
+        torch.stack(latents).contiguous(), batch.depth.half(), batch.intrinsics, size
     )
 
 
@@ -133,6 +137,6 @@ def _fingerprint(model: MiniModel, source: ClipSource) -> dict[str, Any]:
     digest = hashlib.sha256()
     for name, value in model.state_dict().items():
         if not name.startswith("stabilizer."):
-            digest.update(value.detach().float().contiguous().numpy().tobytes())
+            digest.update(value.detach().cpu().float().contiguous().numpy().tobytes())
     described = {key: value for key, value in asdict(source).items() if key != "relist_seconds"}
     return {"model": digest.hexdigest(), "source": json.loads(json.dumps(described, default=str))}

@@ -25,7 +25,9 @@ from dyfn_core.prediction import StreamState
 from dyfn_core.training.base import clip_source
 from dyfn_core.training.config import ConfigError, StabilizerRunConfig
 from dyfn_core.training.latents import LatentCache, LatentClips, encode_clips
-from dyfn_core.training.trainer import Task, coloured_depth
+from dyfn_core.training.pictures import coloured_depth
+from dyfn_core.training.processes import full_precision, part_seed, share_of
+from dyfn_core.training.trainer import Task
 from dyfn_core.training.validation import Sequence, recording_examples, sequence_scores
 
 VALIDATION_SEED = 1_000_000_007
@@ -36,9 +38,11 @@ class StabilizerTask(Task):
 
     model: MiniModel
 
-    def __init__(self, config: StabilizerRunConfig, cache_folder: Path) -> None:
+    def __init__(
+        self, config: StabilizerRunConfig, cache_folder: Path, device: torch.device | str = "cpu"
+    ) -> None:
         self.config = config
-        self.model = build_frozen(config)
+        self.model = build_frozen(config).to(device)
         self.source = clip_source(config, config.cache_length, config.strides)
         folder = config.cache or cache_folder
         self.cache = LatentCache(folder, self.model, self.source, config.cache_draws)
@@ -49,13 +53,24 @@ class StabilizerTask(Task):
         assert stabilizer is not None
         return [{"params": list(stabilizer.parameters()), "lr": self.config.learning_rate}]
 
-    def batches(self, start: int) -> Iterator[LatentClips]:
-        return self.cache.batches(start, self.config.seed, self.config.clips, self.config.length)
+    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[LatentClips]:
+        clips = share_of(self.config.clips, parts, "clips")
+        seed = part_seed(self.config.seed, part)
+        return self.cache.batches(start, seed, clips, self.config.length)
+
+    def images(self, batch: LatentClips) -> int:
+        return batch.latent.shape[0] * batch.latent.shape[1]
 
     def loss(self, batch: LatentClips) -> tuple[Tensor, dict[str, float]]:
         frames = self._decoded_frames()
         latents = unroll(self.model, batch.latent.float())
         points = self._decode(torch.stack([latents[j] for j in frames], 1), batch.image_size)
+        with full_precision(points):
+            return self._terms(batch, points, frames)
+
+    def _terms(
+        self, batch: LatentClips, points: Tensor, frames: list[int]
+    ) -> tuple[Tensor, dict[str, float]]:
         depth = batch.depth[:, frames].float().flatten(0, 1)
         aspect = batch.image_size[1] / batch.image_size[0]
         truth = target_from_depth(depth, batch.intrinsics[:, frames].flatten(0, 1), aspect)
@@ -89,7 +104,7 @@ class StabilizerTask(Task):
     def _decode(self, latents: Tensor, size: tuple[int, int]) -> Tensor:
         """latents B x T x C x h x w -> points B x T x H/2 x W/2 x 3."""
         raw, _ = self.model.decode_raw(Latent(latents.flatten(0, 1), size, size))
-        return remap_exp(raw).unflatten(0, latents.shape[:2])
+        return remap_exp(raw.float()).unflatten(0, latents.shape[:2])
 
     def validate(self) -> dict[str, float]:
         """Image and video AbsRel with and without DyFN; `score` is the rendered video's."""
@@ -108,11 +123,11 @@ class StabilizerTask(Task):
         state: StreamState | None = None
         predicted = []
         for features in sequence.latent:
-            features = features[None].float()
+            features = features[None].to(self.model.device).float()
             if stabilized:
                 features, state = self.model.stabilize(features, state)
             raw, _ = self.model.decode_raw(Latent(features, *2 * (sequence.image_size,)))
-            predicted.append(raw[0, 2].exp().numpy())
+            predicted.append(raw[0, 2].exp().cpu().numpy())
         return sequence_scores(predicted, [depth.float().numpy() for depth in sequence.depth])
 
     def _find_sequences(self) -> dict[str, list[Sequence]]:
@@ -146,7 +161,8 @@ class StabilizerTask(Task):
         size = self.model.network_size(examples[0].image.shape[:2], None)
         for example in examples:
             image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
-            latents.append(self.model.encode_at(image.float() / 255, size).features[0].half())
+            image = image.to(self.model.device).float() / 255
+            latents.append(self.model.encode_at(image, size).features[0].half().cpu())
             rows = (np.arange(size[0] // 2) * 2 + 1) * example.depth.shape[0] // size[0]
             cols = (np.arange(size[1] // 2) * 2 + 1) * example.depth.shape[1] // size[1]
             depths.append(torch.from_numpy(example.depth[rows[:, None], cols[None, :]]))
@@ -154,14 +170,14 @@ class StabilizerTask(Task):
 
     def picture(self, batch: LatentClips) -> np.ndarray:
         """True depth, base and DyFN of one clip's frames, one colour scale a row."""
-        latent, size = batch.latent[:1].float(), batch.image_size
+        latent, size = batch.latent[:1].to(self.model.device).float(), batch.image_size
         stabilized = torch.stack(unroll(self.model, latent), 1)
         frames = list(range(0, latent.shape[1], max(1, latent.shape[1] // 6)))[:6]
         base, ours = (
-            self._decode(which[:, frames], size)[0, ..., 2].numpy()
+            self._decode(which[:, frames], size)[0, ..., 2].cpu().numpy()
             for which in (latent, stabilized)
         )
-        true = batch.depth[0, frames].float().numpy()
+        true = batch.depth[0, frames].float().cpu().numpy()
         return np.vstack([coloured_depth(np.hstack(list(row))) for row in (true, base, ours)])
 
 
@@ -187,9 +203,6 @@ def build_frozen(config: StabilizerRunConfig) -> MiniModel:
         model.stabilizer.requires_grad_(True)
         return model.train()
     torch.manual_seed(config.seed)
-    try:
-        described = StabilizerConfig(**config.stabilizer)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"stabilizer: {error}") from error
+    described = StabilizerConfig(**config.stabilizer)
     model.stabilizer = build_stabilizer(model.latent_channels, described)
     return model.train()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import random
 import time
@@ -11,26 +12,37 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
-from torch.utils.tensorboard import SummaryWriter
 
-from dyfn_core.data.clips import ClipBatch
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import save_model
+from dyfn_core.training.checkpoint import DamagedCheckpointError, has_state, read_state, write_state
 from dyfn_core.training.config import RunConfig
 from dyfn_core.training.ema import Ema
+from dyfn_core.training.processes import Processes
+from dyfn_core.training.run_folder import RunFolder
+from dyfn_core.training.signals import StopSignals
 
-STATE_FILE = "state.pt"
 MODEL_FILE = "model.safetensors"
 BEST_FILE = "best.safetensors"
+COUNTERS = ("step", "seconds", "images", "best", "bad_steps", "skipped_steps")
+
+logger = logging.getLogger(__name__)
 
 
 class TrainingError(RuntimeError):
     """A run that cannot go on; the message says why."""
+
+
+class InterruptedRunError(RuntimeError):
+    """A run that a signal ended after a checkpoint. number: the signal's."""
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.number = number
 
 
 class Task(ABC):
@@ -43,12 +55,19 @@ class Task(ABC):
         """Parameter groups for AdamW, each with its own "lr"."""
 
     @abstractmethod
-    def batches(self, start: int) -> Iterator[Any]:
-        """Batches from step `start` on."""
+    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[Any]:
+        """One part of the batches from step `start` on; a dataclass of tensors each.
+
+        Raises ConfigError when the batch cannot be split into so many equal parts.
+        """
+
+    @abstractmethod
+    def images(self, batch: Any) -> int:
+        """How many images a part of a batch holds."""
 
     @abstractmethod
     def loss(self, batch: Any) -> tuple[Tensor, dict[str, float]]:
-        """The loss to minimise, and values to log."""
+        """The loss to minimise, a mean over the part, and values to log."""
 
     @abstractmethod
     def validate(self) -> dict[str, float]:
@@ -67,63 +86,107 @@ class Trainer:
     """One run in one folder: train() goes on from the folder's checkpoint when resuming.
 
     The folder gets state.pt (to resume), model.safetensors (the averaged model), best.safetensors
-    (the one with the best validation score), TensorBoard scalars and pictures, and log.jsonl.
+    (the one with the best validation score), and what RunFolder writes. Only the main process
+    writes. Raises TrainingError when the folder holds a run already, or none to resume.
     """
 
-    def __init__(self, task: Task, config: RunConfig, out: Path, resume: bool) -> None:
+    def __init__(
+        self,
+        task: Task,
+        config: RunConfig,
+        out: Path,
+        resume: bool,
+        processes: Processes | None = None,
+    ) -> None:
         self.task, self.config, self.out = task, config, out
-        torch.set_num_threads(config.threads)
-        out.mkdir(parents=True, exist_ok=True)
+        self.processes = processes or Processes(config)
+        task.model.to(self.processes.device)
         groups = task.groups()
         self.rates = [group["lr"] for group in groups]
         self.optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay)
         self.trained = [p for group in groups for p in group["params"]]
         self.ema = Ema(task.model, config.ema_decay)
-        self.step, self.seconds, self.bad_steps, self.best = 0, 0.0, 0, math.inf
-        state = out / STATE_FILE
+        self.module = self.processes.wrap(task.model, task.loss)
+        self.stepper = self.processes.accelerator.prepare(self.optimizer)
+        self.step, self.images, self.bad_steps, self.skipped_steps = 0, 0, 0, 0
+        self.seconds, self.best = 0.0, math.inf
+        self.scores: dict[str, float] = {}
         if resume:
-            self._load(state)
-        elif state.exists():
+            self._load()
+        elif has_state(out):
             raise TrainingError(f"{out} already holds a run; give --resume or another folder")
-        self.writer = SummaryWriter(str(out / "tensorboard"))
+        self.processes.wait()
+        self.folder = self._open_folder() if self.processes.is_main else None
+
+    def _open_folder(self) -> RunFolder:
+        facts = {
+            "processes": self.processes.count,
+            "parts": self.processes.parts,
+            "device": self.processes.device.type,
+            "mixed_precision": self.config.mixed_precision,
+        }
+        return RunFolder(self.out, self.config, self.step, facts)
 
     def train(self, max_steps: int | None = None) -> None:
         """Run to the end of the schedule, or until the step count reaches max_steps.
 
-        Raises TrainingError after more than `most_bad_steps` steps in a row without a finite loss.
+        Raises TrainingError after more than `most_bad_steps` steps in a row without a finite
+        loss and gradient, InterruptedRunError after SIGINT or SIGTERM. Both leave a checkpoint.
         """
         last = min(self.config.steps, max_steps or self.config.steps)
-        batches = self.task.batches(self.step)
-        saved = shown = time.monotonic()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        with Progress(*columns, TimeRemainingColumn()) as progress:
+        quiet = not self.processes.is_main
+        with (
+            StopSignals() as signals,
+            Progress(*columns, TimeRemainingColumn(), disable=quiet) as progress,
+        ):
             bar = progress.add_task("training", total=last, completed=self.step)
-            while self.step < last and self.progress() < 1:
-                started = time.monotonic()
-                batch = next(batches)
-                waited = time.monotonic() - started
-                values = self._step(batch)
-                now = time.monotonic()
-                self.step, self.seconds = self.step + 1, self.seconds + now - started
-                if self.step % self.config.log_every == 0:
-                    values["wait_seconds"], values["step_seconds"] = waited, now - started
-                    values["rate"] = self.optimizer.param_groups[-1]["lr"]
-                    self._log("train", values)
-                    rate = self.config.log_every / (now - shown)
-                    shown = now
-                    loss = values.get("loss", math.nan)
-                    label = f"loss {loss:.4f}  {rate:.2f} steps/s"
-                    progress.update(bar, completed=self.step, description=label)
-                if self.step % self.config.picture_every == 0:
-                    self._show(batch)
-                if self.step % self.config.validate_every == 0:
-                    self._validate()
-                if now - saved > 60 * self.config.checkpoint_minutes:
-                    self.save()
-                    saved = time.monotonic()
+            stopped = self._loop(last, signals, progress, bar)
+        if stopped:
+            self.save()
+            self._close()
+            name = signals.name or "a signal to another process"
+            raise InterruptedRunError(
+                f"{name}: checkpoint written at step {self.step}; go on with --resume",
+                signals.number or 15,
+            )
         self._validate()
         self.save()
-        self.writer.close()
+        if self.folder is not None and self.progress() >= 1:
+            self.folder.results(self._summary())
+        self._close()
+
+    def _loop(self, last: int, signals: StopSignals, progress: Progress, bar: Any) -> bool:
+        """Steps up to `last`; True when a signal ended them early."""
+        streams = [
+            self.task.batches(self.step, part, self.processes.parts)
+            for part in self.processes.own_parts
+        ]
+        saved = shown = time.monotonic()
+        while self.step < last and self.progress() < 1:
+            started = time.monotonic()
+            batches = [next(stream) for stream in streams]
+            waited = time.monotonic() - started
+            values, stop = self._step(batches, signals, started)
+            if self.step % self.config.log_every == 0:
+                now = time.monotonic()
+                values["wait_seconds"], values["step_seconds"] = waited, now - started
+                values["rate"] = self.optimizer.param_groups[-1]["lr"]
+                self._log("train", self.processes.mean(values))
+                label = f"loss {values.get('loss', math.nan):.4f}"
+                label += f"  {self.config.log_every / (now - shown):.2f} steps/s"
+                progress.update(bar, completed=self.step, description=label)
+                shown = now
+            if self.step % self.config.picture_every == 0:
+                self._show(batches[0])
+            if self.step % self.config.validate_every == 0:
+                self._validate()
+            if stop:
+                return True
+            if time.monotonic() - saved > 60 * self.config.checkpoint_minutes:
+                self.save()
+                saved = time.monotonic()
+        return False
 
     def progress(self) -> float:
         """Share of the schedule that is over, by steps or by time, whichever is further."""
@@ -132,65 +195,91 @@ class Trainer:
             share = max(share, self.seconds / (3600 * self.config.hours))
         return share
 
-    def _step(self, batch: Any) -> dict[str, float]:
+    def _step(
+        self, batches: list[Any], signals: StopSignals, started: float
+    ) -> tuple[dict[str, float], bool]:
+        """One step: logged values, and whether to stop. Changes nothing if it is not finite."""
+        self._set_rates()
+        self.optimizer.zero_grad(set_to_none=True)
+        seed = self.config.seed * 1_000_003 + self.step
+        total, values = self.processes.backward(self.module, batches, seed)
+        norm = self.processes.clip(self.trained, self.config.clip_norm)
+        values["gradient_norm"] = norm
+        finite, stop, seconds = self.processes.agree(
+            math.isfinite(total) and math.isfinite(norm),
+            signals.number is not None,
+            self.seconds + time.monotonic() - started,
+        )
+        if finite:
+            self.stepper.step()
+            self.ema.update()
+        else:
+            self.processes.skip()
+        self.step, self.seconds = self.step + 1, seconds
+        self.images += self.processes.count * sum(map(self.task.images, batches))
+        self._count_bad(finite)
+        return values, stop
+
+    def _set_rates(self) -> None:
         warm = min(1.0, (self.step + 1) / max(1, self.config.warmup_steps))
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, self.progress())))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
             group["lr"] = rate * warm * (0.01 + 0.99 * cosine)
-        torch.manual_seed(self.config.seed * 1_000_003 + self.step)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss, values = self.task.loss(batch)
-        finite = bool(torch.isfinite(loss))
-        if finite:
-            loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip_norm)
-            values["gradient_norm"] = float(norm)
-            finite = math.isfinite(values["gradient_norm"])
+
+    def _count_bad(self, finite: bool) -> None:
         self.bad_steps = 0 if finite else self.bad_steps + 1
-        if self.bad_steps > self.config.most_bad_steps:
-            raise TrainingError(
-                f"no finite loss or gradient in {self.bad_steps} steps up to step {self.step}"
-            )
         if finite:
-            self.optimizer.step()
-            self.ema.update()
-        else:
-            self._log("train", {"skipped": 1.0})
-        return values
+            return
+        self.skipped_steps += 1
+        self._log("train", {"skipped": float(self.skipped_steps)})
+        if self.bad_steps > self.config.most_bad_steps:
+            self.save()
+            self._close()
+            raise TrainingError(
+                f"no finite loss or gradient in {self.bad_steps} steps up to step {self.step}: "
+                "the learning rate may be too high, or the data damaged; state.pt holds the "
+                "last good parameters"
+            )
 
     def _validate(self) -> None:
-        with self.ema.applied(), torch.no_grad():
-            self.task.model.eval()
-            scores = self.task.validate()
-            if scores.get("score", math.inf) < self.best:
-                self.best = scores["score"]
-                self._export(self.out / BEST_FILE)
-            self.task.model.train()
-        self._log("validation", scores)
+        if self.folder is not None:
+            with self.ema.applied(), torch.no_grad():
+                self.task.model.eval()
+                self.scores = self.task.validate()
+                if self.scores.get("score", math.inf) < self.best:
+                    self.best = self.scores["score"]
+                    self._export(self.out / BEST_FILE)
+                self.task.model.train()
+            self._log("validation", self.scores)
+        self.processes.wait()
 
     def _show(self, batch: Any) -> None:
-        with self.ema.applied(), torch.no_grad():
-            self.task.model.eval()
-            strip = self.task.picture(batch)
-            self.task.model.train()
-        self.writer.add_image("strip", strip, self.step, dataformats="HWC")
-        folder = self.out / "pictures"
-        folder.mkdir(exist_ok=True)
-        cv2.imwrite(str(folder / f"{self.step:07d}.jpg"), strip[..., ::-1])
+        if self.folder is not None:
+            with self.ema.applied(), torch.no_grad():
+                self.task.model.eval()
+                strip = self.task.picture(batch)
+                self.task.model.train()
+            self.folder.picture(self.step, strip)
 
     def _log(self, group: str, values: dict[str, float]) -> None:
-        for name, value in values.items():
-            self.writer.add_scalar(f"{group}/{name}", value, self.step)
-        line = {"step": self.step, "seconds": round(self.seconds, 1), "group": group, **values}
-        with (self.out / "log.jsonl").open("a") as log:
-            log.write(json.dumps(line) + "\n")
+        if self.folder is not None:
+            seconds = round(self.seconds, 1)
+            self.folder.log(group, self.step, values, seconds=seconds, images=self.images)
+
+    def _summary(self) -> dict[str, Any]:
+        return {**{name: getattr(self, name) for name in COUNTERS}, **self.scores}
+
+    def _close(self) -> None:
+        if self.folder is not None:
+            self.folder.close()
+        self.processes.wait()
 
     def save(self) -> None:
         """Write state.pt and the averaged model, each whole or not at all."""
+        if self.folder is None:
+            return
         state = {
-            "step": self.step,
-            "seconds": self.seconds,
-            "best": self.best,
+            **{name: getattr(self, name) for name in COUNTERS},
             "model": self.task.model.state_dict(),
             "optimizer": self._moments(),
             "ema": self.ema.state_dict(),
@@ -199,9 +288,7 @@ class Trainer:
             "numpy_rng": json.dumps(np.random.get_state(legacy=False), default=np.ndarray.tolist),
             "python_rng": random.getstate(),
         }
-        partial = self.out / (STATE_FILE + ".partial")
-        torch.save(state, partial)
-        partial.replace(self.out / STATE_FILE)
+        write_state(self.out, state)
         with self.ema.applied():
             self._export(self.out / MODEL_FILE)
 
@@ -217,46 +304,35 @@ class Trainer:
         trained = {id(parameter) for parameter in self.trained}
         for name, parameter in self.task.model.named_parameters():
             if name in moments and id(parameter) in trained:
-                self.optimizer.state[parameter] = dict(moments[name])
+                self.optimizer.state[parameter] = {
+                    key: value if key == "step" else value.to(parameter.device)
+                    for key, value in moments[name].items()
+                }
 
     def _export(self, path: Path) -> None:
         notes = {"trained_steps": str(self.step), "trained_seconds": f"{self.seconds:.0f}"}
         save_model(self.task.export_model(), path, notes=notes)
 
-    def _load(self, path: Path) -> None:
-        if not path.exists():
-            raise TrainingError(f"nothing to resume: no {path}")
-        state = torch.load(path, map_location="cpu", weights_only=True)
+    def _load(self) -> None:
+        try:
+            state = read_state(self.out)
+        except (FileNotFoundError, DamagedCheckpointError) as error:
+            raise TrainingError(str(error)) from error
+        self._tell_changes(state["config"])
         self.task.model.load_state_dict(state["model"], strict=True)
         self._restore_moments(state["optimizer"])
         self.ema.load_state_dict(state["ema"])
-        self.step, self.seconds = int(state["step"]), float(state["seconds"])
-        self.best = float(state["best"])
+        for name in COUNTERS:
+            own = getattr(self, name)
+            setattr(self, name, type(own)(state.get(name, own)))
         torch.set_rng_state(state["torch_rng"])
         np.random.set_state(json.loads(state["numpy_rng"]))
         version, internal, gauss = state["python_rng"]
         random.setstate((version, tuple(internal), gauss))
 
-
-def picture_rows(batch: ClipBatch, depth: Tensor, count: int = 6) -> np.ndarray:
-    """Image, true depth and predicted depth (B x h x w) of the first frames, one column each."""
-    columns = []
-    for index in range(min(count, len(depth))):
-        image = batch.image[index, 0].permute(1, 2, 0).numpy()
-        size = (image.shape[1], image.shape[0])
-        true, ours = batch.depth[index, 0].numpy(), depth[index].numpy()
-        columns.append(np.vstack([image, coloured_depth(true, size), coloured_depth(ours, size)]))
-    return np.hstack(columns)
-
-
-def coloured_depth(depth: np.ndarray, size: tuple[int, int] | None = None) -> np.ndarray:
-    """H x W depth -> RGB, near red, far blue, invalid black; resized to (width, height)."""
-    valid = np.isfinite(depth) & (depth > 0)
-    near = np.zeros_like(depth)
-    near[valid] = 1 / depth[valid]
-    low, high = np.percentile(near[valid], [2, 98]) if valid.any() else (0.0, 1.0)
-    scaled = np.clip((near - low) / max(high - low, 1e-9), 0, 1)
-    coloured = cv2.applyColorMap((255 * scaled).astype(np.uint8), cv2.COLORMAP_TURBO)
-    coloured[~valid] = 0
-    rgb = np.ascontiguousarray(coloured[..., ::-1])
-    return rgb if size is None else cv2.resize(rgb, size, interpolation=cv2.INTER_NEAREST)
+    def _tell_changes(self, before: dict[str, Any]) -> None:
+        now = self.config.model_dump(mode="json")
+        for name in sorted({*now, *before}):
+            if now.get(name) != before.get(name):
+                old, new = before.get(name), now.get(name)
+                logger.warning("resuming with another %s: %r, was %r", name, new, old)

@@ -63,7 +63,8 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
     errors, shares = [], []
     for example in examples:
         image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
-        depth = model.decode(model.encode(image.float() / 255)).points[0, ..., 2].numpy()
+        latent = model.encode(image.to(model.device).float() / 255)
+        depth = model.decode(latent).points[0, ..., 2].cpu().numpy()
         valid = np.isfinite(example.depth) & (example.depth > 1e-3)
         if valid.sum() < 100:
             continue

@@ -1,0 +1,105 @@
+"""A tiny task whose loss is a plain mean over a batch, and the means to run it anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from conftest import PinholeModel
+from torch import Tensor
+
+from dyfn_core.training.config import RunConfig
+from dyfn_core.training.processes import Processes, share_of
+from dyfn_core.training.trainer import Task, Trainer
+
+BATCH = 4
+
+
+@dataclass(frozen=True)
+class Latents:
+    """B x 3 x h x w."""
+
+    features: Tensor
+
+
+class ToyTask(Task):
+    """DyFN of a pinhole model learns to double its latent; everything else is frozen.
+
+    poison: steps whose batch holds a NaN. Parts are slices of one and the same batch.
+    """
+
+    def __init__(self, poison: tuple[int, ...] = ()) -> None:
+        self.model = PinholeModel(stabilized=True)
+        self.model.unit.requires_grad_(False)
+        self.poison = poison
+
+    def groups(self) -> list[dict[str, Any]]:
+        assert self.model.stabilizer is not None
+        return [{"params": list(self.model.stabilizer.parameters()), "lr": 1e-2}]
+
+    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[Latents]:
+        size = share_of(BATCH, parts, "the batch")
+        step = start
+        while True:
+            draw = torch.Generator().manual_seed(step)
+            features = torch.rand(BATCH, 3, 6, 8, generator=draw)[part * size : (part + 1) * size]
+            yield Latents(features * (torch.nan if step in self.poison else 1.0))
+            step += 1
+
+    def images(self, batch: Latents) -> int:
+        return len(batch.features)
+
+    def loss(self, batch: Latents) -> tuple[Tensor, dict[str, float]]:
+        changed, _ = self.model.stabilize(batch.features * self.model.unit, None)
+        loss = (changed - 2 * batch.features).square().mean()
+        return loss, {"loss": float(loss.detach())}
+
+    def validate(self) -> dict[str, float]:
+        batch = Latents(torch.full((1, 3, 6, 8), 0.25).cumsum(-1))
+        return {"score": self.loss(batch)[1]["loss"]}
+
+    def picture(self, batch: Latents) -> np.ndarray:
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+def toy_config(**changes: Any) -> RunConfig:
+    """Settings of a toy run; six steps unless told otherwise."""
+    settings: dict[str, Any] = {
+        "data": ["unused"],
+        "stages": [{"from_step": 0, "batch": BATCH, "sizes": [[32, 32]]}],
+        "steps": 6,
+        "threads": 1,
+        "device": "cpu",
+        "warmup_steps": 2,
+        "log_every": 1,
+        "picture_every": 4,
+        "validate_every": 3,
+        "checkpoint_minutes": 1e-9,  # after every step
+    }
+    return RunConfig(**{**settings, **changes})
+
+
+def run_toy(out: Path, resume: bool = False, **changes: Any) -> Trainer:
+    """A toy run to its end."""
+    torch.manual_seed(1)
+    config = toy_config(**changes)
+    trainer = Trainer(ToyTask(), config, out, resume, Processes(config))
+    trainer.train()
+    return trainer
+
+
+def environment() -> dict[str, str]:
+    """What a subprocess needs to find this module and to compute as this process does."""
+    places = [str(Path(__file__).parent), *filter(None, sys.path)]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
+
+
+if __name__ == "__main__":
+    run_toy(Path(sys.argv[1]), sys.argv[2] == "resume", **json.loads(sys.argv[3]))
