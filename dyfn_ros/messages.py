@@ -112,11 +112,17 @@ class Calibration:
     """What a CameraInfo says about one image.
 
     matrix: 3 x 3 float64, pixels of the image at hand (binning and region of interest applied).
-    distorted: whether the lens model is more than a pinhole.
+    model: name of the lens model. d: its coefficients; empty for rectified images.
     """
 
     matrix: np.ndarray
-    distorted: bool
+    model: str = ""
+    d: tuple[float, ...] = ()
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens model is more than a pinhole."""
+        return any(self.d)
 
 
 def _window(info: Any) -> tuple[int, int, int, int]:
@@ -155,8 +161,8 @@ def decode_camera_info(
     matrix[1, 2] = (matrix[1, 2] - y + 0.5) / bin_y - 0.5
     matrix[0, :2] /= bin_x
     matrix[1, 1] /= bin_y
-    distorted = not rectified and bool(np.any(np.asarray(_field(info, "d"), np.float64)))
-    return Calibration(matrix, distorted)
+    d = () if rectified else tuple(float(value) for value in _field(info, "d"))
+    return Calibration(matrix, str(info.distortion_model), d)
 
 
 def _field(info: Any, name: str) -> Any:

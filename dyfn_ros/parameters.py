@@ -1,10 +1,11 @@
-"""The node's parameters: one table, from which they are declared, checked and read."""
+"""The parameter table on a ROS node: declared, checked and read."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -12,98 +13,14 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
+from dyfn_ros.parameter_table import CONFIGURE, LIMITS, SPECS, START, Settings, Spec, show
 
-@dataclass(frozen=True)
-class Spec:
-    """One parameter. range: both ends are allowed values. choices: for strings."""
-
-    default: str | bool | int | float
-    description: str
-    read_only: bool = True
-    range: tuple[float, float] | None = None
-    choices: tuple[str, ...] = ()
-
-
-SPECS: dict[str, Spec] = {
-    "model": Spec("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
-    "device": Spec("auto", "Where to run: auto (a GPU if there is one), cpu, cuda, cuda:N."),
-    "threads": Spec(0, "CPU threads for inference; 0 leaves the default.", range=(0, 1024)),
-    "image_transport": Spec(
-        "raw",
-        "raw subscribes `image`, compressed subscribes `image/compressed`.",
-        choices=("raw", "compressed"),
-    ),
-    "reliability": Spec(
-        "auto",
-        "Of the subscriptions; auto is reliable when drop_frames is false, else best effort, "
-        "which every camera driver matches.",
-        choices=("auto", "best_effort", "reliable"),
-    ),
-    "drop_frames": Spec(
-        True,
-        "Work on the latest frame and drop those that came meanwhile. False: queue and work on "
-        "every frame in order, for recordings.",
-    ),
-    "queue_size": Spec(
-        1000, "Frames that may wait when drop_frames is false.", range=(1, 1_000_000)
-    ),
-    "wait_for_camera_info": Spec(
-        False, "Hold the first frames until a CameraInfo has come, so that all have intrinsics."
-    ),
-    "rectified": Spec(False, "The images are rectified: take P of the CameraInfo instead of K."),
-    "stabilize": Spec(True, "Use DyFN. A change starts the stream anew.", read_only=False),
-    "num_tokens": Spec(
-        0,
-        "Resolution inside the model; 0 is the model's own. A change starts the stream anew.",
-        read_only=False,
-        range=(0, 100_000),
-    ),
-    "publish_depth": Spec(True, "Publish ~/depth when somebody subscribes.", read_only=False),
-    "publish_points": Spec(True, "Publish ~/points when somebody subscribes.", read_only=False),
-    "min_depth": Spec(
-        0.0,
-        "Nearer points become NaN; in the unit of the output depth.",
-        read_only=False,
-        range=(0.0, 1e6),
-    ),
-    "max_depth": Spec(
-        0.0,
-        "Farther points become NaN; in the unit of the output depth; 0 is no limit.",
-        read_only=False,
-        range=(0.0, 1e6),
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The values in force; a new one for each change."""
-
-    model: str
-    device: str
-    threads: int
-    image_transport: str
-    reliability: str
-    drop_frames: bool
-    queue_size: int
-    wait_for_camera_info: bool
-    rectified: bool
-    stabilize: bool
-    num_tokens: int
-    publish_depth: bool
-    publish_points: bool
-    min_depth: float
-    max_depth: float
-
-    @property
-    def reliable(self) -> bool:
-        if self.reliability == "auto":
-            return not self.drop_frames
-        return self.reliability == "reliable"
+_CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
 def usage(arguments: Sequence[str]) -> None:
@@ -112,8 +29,7 @@ def usage(arguments: Sequence[str]) -> None:
     arguments: with the program's name first.
     """
     lines = [
-        f"  {name:22}{spec.description} [{str(spec.default).lower()}]"
-        for name, spec in SPECS.items()
+        f"  {name:22}{spec.description} [{show(spec.default)}]" for name, spec in SPECS.items()
     ]
     parser = argparse.ArgumentParser(
         prog="stream_depth",
@@ -126,9 +42,13 @@ def usage(arguments: Sequence[str]) -> None:
 
 
 def _descriptor(spec: Spec) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=spec.description, read_only=spec.read_only)
+    descriptor = ParameterDescriptor(description=spec.description, read_only=spec.changes == START)
     if spec.choices:
         descriptor.additional_constraints = f"one of {', '.join(spec.choices)}"
+    if spec.changes == CONFIGURE:
+        text = "changes only while the node is unconfigured"
+        known = descriptor.additional_constraints
+        descriptor.additional_constraints = f"{known}; {text}" if known else text
     if spec.range is not None:
         low, high = spec.range
         if isinstance(spec.default, int):
@@ -138,50 +58,110 @@ def _descriptor(spec: Spec) -> ParameterDescriptor:
     return descriptor
 
 
-def check(changes: Sequence[Parameter], depths: tuple[float, float]) -> SetParametersResult:
-    """What the descriptors cannot say. depths: min_depth and max_depth in force."""
-    near, far = depths
-    for parameter in changes:
-        spec = SPECS.get(parameter.name)
-        if spec and spec.choices and parameter.value not in spec.choices:
-            return SetParametersResult(
-                successful=False,
-                reason=f"{parameter.name} is {parameter.value!r}, expected one of {spec.choices}",
-            )
-        near = parameter.value if parameter.name == "min_depth" else near
-        far = parameter.value if parameter.name == "max_depth" else far
-    if far and near >= far:
-        return SetParametersResult(
-            successful=False, reason=f"min_depth {near} must be below max_depth {far}"
-        )
-    return SetParametersResult(successful=True)
+def check(changes: Mapping[str, Any], in_force: Mapping[str, Any], configured: bool = False) -> str:
+    """What the descriptors cannot say. -> why the changes are refused, or "".
+
+    changes, in_force: values by name, for the whole node or for one camera, without its name.
+    """
+    for name, value in changes.items():
+        spec = SPECS.get(name)
+        if spec is None:
+            continue
+        if spec.choices and value not in spec.choices:
+            return f"{name} is {value!r}, expected one of {spec.choices}"
+        if configured and spec.changes == CONFIGURE:
+            return f"{name} can change only while the node is unconfigured (see `ros2 lifecycle`)"
+    values = {**in_force, **changes}
+    for low, high in LIMITS:
+        if values.get(high) and values.get(low, 0.0) >= values[high]:
+            return f"{low} {values[low]} must be below {high} {values[high]}"
+    return ""
+
+
+def check_cameras(names: Sequence[str]) -> str:
+    """-> why these are no names of cameras, or ""."""
+    if list(names) == [""]:
+        return ""
+    if not names:
+        return "cameras is empty, expected at least one name"
+    for name in names:
+        if not _CAMERA_NAME.fullmatch(name):
+            return f"cameras has {name!r}, expected letters, digits and _ after a first letter"
+        if name in SPECS or name in ("depth", "points", "qos_overrides"):
+            return f"cameras has {name!r}, which is the name of something else"
+    if len(set(names)) < len(names):
+        return f"cameras names one twice: {list(names)}"
+    return ""
 
 
 class NodeParameters:
-    """Declares the table on a node and keeps `settings` up to date.
+    """Declares the table on a node and keeps the settings up to date.
 
+    A value for one camera, `CAMERA.NAME`, is declared when it is given at start; without it the
+    node's value is in force. configured: whether CONFIGURE parameters are fixed just now.
     Raises rclpy's InvalidParameterValueException or InvalidParameterTypeException when a value
     given at start is not allowed.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, configured: Callable[[], bool] = lambda: False) -> None:
         self._node = node
+        self._configured = configured
+        self._own: dict[str, dict[str, str]] = {}
         node.add_on_set_parameters_callback(self._check)
         for name, spec in SPECS.items():
             node.declare_parameter(name, spec.default, _descriptor(spec))
-        self.settings = self._read()
+        self.settings = self._read("")
+        if reason := check_cameras(self.settings.cameras):
+            raise InvalidParameterValueException("cameras", self.settings.cameras, reason)
+        for camera in self.settings.cameras:
+            self._own[camera] = self._declare_own(camera)
+        self._by_camera = {camera: self._read(camera) for camera in self._own}
         node.add_post_set_parameters_callback(self._changed)
 
-    def _read(self) -> Settings:
-        return Settings(**{name: self._node.get_parameter(name).value for name in SPECS})
+    def camera(self, name: str) -> Settings:
+        """The settings of one camera."""
+        return self._by_camera[name]
+
+    def _declare_own(self, camera: str) -> dict[str, str]:
+        """Parameter by setting, for the settings that this camera has for itself."""
+        given = self._node._parameter_overrides if camera else {}
+        own: dict[str, str] = {}
+        for full in given:
+            prefix, _, name = full.partition(".")
+            if prefix != camera:
+                continue
+            spec = SPECS.get(name)
+            if spec is None or not spec.per_camera:
+                reason = "no parameter that a camera has for itself"
+                raise InvalidParameterValueException(full, given[full].value, reason)
+            self._node.declare_parameter(full, spec.default, _descriptor(spec))
+            own[name] = full
+        values = {name: self._node.get_parameter(full).value for name, full in own.items()}
+        if reason := check(values, vars(self.settings)):
+            raise InvalidParameterValueException(camera, str(values), f"{camera}: {reason}")
+        return own
+
+    def _read(self, camera: str) -> Settings:
+        own = self._own.get(camera, {})
+        values = {name: self._node.get_parameter(own.get(name, name)).value for name in SPECS}
+        return Settings(**values)
 
     def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        declared = ("min_depth", "max_depth")
-        near, far = (
-            self._node.get_parameter(name).value if self._node.has_parameter(name) else 0.0
-            for name in declared
-        )
-        return check(changes, (near, far))
+        declared = {
+            name: self._node.get_parameter(name).value
+            for name in SPECS
+            if self._node.has_parameter(name)
+        }
+        values = {parameter.name: parameter.value for parameter in changes}
+        reason = check(values, declared, self._configured())
+        for own in self._own.values():
+            special = {name: full for name, full in own.items() if self._node.has_parameter(full)}
+            now = {name: self._node.get_parameter(full).value for name, full in special.items()}
+            new = {name: values[full] for name, full in own.items() if full in values}
+            shared = {name: value for name, value in values.items() if name not in own}
+            reason = reason or check({**shared, **new}, {**declared, **now}, self._configured())
+        return SetParametersResult(successful=not reason, reason=reason)
 
     def _changed(self, _: Sequence[Parameter]) -> None:
-        self.settings = self._read()
+        self.settings = self._read("")
+        self._by_camera = {camera: self._read(camera) for camera in self._own}

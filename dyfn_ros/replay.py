@@ -26,7 +26,7 @@ from dyfn_core.evaluation.sequence import (
     curve_picture,
     score_table,
 )
-from dyfn_ros.camera_stream import CameraStream, stream_maker
+from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
 from dyfn_ros.replay_recording import ReplayRecording
 
@@ -152,11 +152,14 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
             seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
             stamp = seconds + nanoseconds * 1e-9
             geometry = camera.push(
-                frame.image,
-                frame.camera_matrix,
-                stamp=stamp,
-                stabilize=options.stabilizer,
-                num_tokens=options.num_tokens or 0,
+                StreamFrame(
+                    frame.image,
+                    frame.camera_matrix,
+                    stamp=stamp,
+                    frame_id=frame.frame_id,
+                    stabilize=options.stabilizer,
+                    num_tokens=options.num_tokens or 0,
+                )
             )
             latency = time.perf_counter() - start
             try:

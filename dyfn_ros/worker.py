@@ -1,104 +1,133 @@
-"""A thread that takes frames one at a time, so that nobody else waits for inference."""
+"""A thread that takes frames of several cameras, so that nobody else waits for inference."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
 
-class FrameWorker(Generic[T]):
-    """Calls `work(frame)` for the submitted frames, in order, in one thread of its own.
+@dataclass
+class _Source(Generic[T]):
+    held: bool
+    waiting: deque[T] = field(default_factory=deque)
+    dropped: int = 0
 
-    With keep_all False it holds one waiting frame, the latest: a newer one replaces it, and the
-    replaced one counts as dropped. With keep_all True it holds up to `capacity` frames and refuses
-    (and counts) what comes when they are full.
+
+class FrameWorker(Generic[T]):
+    """Calls `work(frames)` in one thread of its own, with at most one frame of each source.
+
+    What waits when the thread is free is taken together; no source waits for another's frame.
+    With keep_all False each source holds one waiting frame, the latest: a newer one replaces it,
+    and the replaced one counts as dropped. With keep_all True it holds up to `capacity` frames,
+    in order, and refuses (and counts) what comes when they are full.
 
     prepare: runs first, in the same thread (loading a model). An exception from it, or from
-    `work`, ends the thread and goes to `failed`.
+    `work`, ends the thread and is then `error`. held: per source, whether its frames wait for
+    `release`.
     """
 
     def __init__(
         self,
-        work: Callable[[T], None],
+        work: Callable[[list[T]], None],
         *,
         prepare: Callable[[], None] = lambda: None,
-        failed: Callable[[BaseException], None] = lambda error: None,
         keep_all: bool = False,
         capacity: int = 1,
-        held: bool = False,
+        held: Sequence[bool] = (False,),
     ) -> None:
-        self._work, self._prepare, self._failed = work, prepare, failed
+        self._work, self._prepare = work, prepare
         self._keep_all = keep_all
         self._capacity = capacity if keep_all else 1
-        self._held = held
         self._stopping = False
-        self._waiting: deque[T] = deque()
-        self._dropped = 0
+        self._sources: list[_Source[T]] = [_Source(waits) for waits in held]
         self._changed = threading.Condition()
+        self._prepared = False
+        self.error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="inference", daemon=True)
 
-    @property
-    def dropped(self) -> int:
-        """Frames that were replaced, refused or discarded before they started."""
+    def dropped(self, source: int = 0) -> int:
+        """Frames of a source that were replaced, refused or discarded before they started."""
         with self._changed:
-            return self._dropped
+            return self._sources[source].dropped
 
     def start(self) -> None:
         self._thread.start()
 
-    def submit(self, frame: T) -> bool:
+    def wait_prepared(self, patience: float) -> bool:
+        """Whether prepare has ended, well or with `error`, within so many seconds."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._prepared or self.error is not None, patience
+            )
+
+    def submit(self, frame: T, source: int = 0) -> bool:
         """Never waits for the work. -> False when the frame was refused."""
         with self._changed:
-            if len(self._waiting) == self._capacity:
-                self._dropped += 1
+            queue = self._sources[source]
+            if len(queue.waiting) == self._capacity:
+                queue.dropped += 1
                 if self._keep_all:
                     return False
-                self._waiting.popleft()
-            self._waiting.append(frame)
-            self._changed.notify()
+                queue.waiting.popleft()
+            queue.waiting.append(frame)
+            self._changed.notify_all()
             return True
 
-    def release(self) -> None:
-        """Let a worker that was made with held=True begin with what waits."""
+    def release(self, source: int = 0) -> None:
+        """Let a source that was made held begin with what waits."""
         with self._changed:
-            self._held = False
-            self._changed.notify()
+            self._sources[source].held = False
+            self._changed.notify_all()
 
-    def discard(self) -> int:
+    def discard(self, source: int = 0) -> int:
         """Drop what waits; the frame being worked on is finished. -> how many were dropped."""
         with self._changed:
-            count = len(self._waiting)
-            self._waiting.clear()
-            self._dropped += count
-            return count
+            return self._discard(self._sources[source])
+
+    def _discard(self, queue: _Source[T]) -> int:
+        count = len(queue.waiting)
+        queue.waiting.clear()
+        queue.dropped += count
+        return count
 
     def stop(self, patience: float | None = None) -> bool:
-        """Drop what waits and let the frame being worked on finish.
+        """Drop what waits and let the frames being worked on finish.
 
         patience: seconds to wait for that; None waits as long as it takes. -> whether it finished.
         """
         with self._changed:
             self._stopping = True
-            self._dropped += len(self._waiting)
-            self._waiting.clear()
-            self._changed.notify()
+            for queue in self._sources:
+                self._discard(queue)
+            self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(patience)
         return not self._thread.is_alive()
 
-    def _next(self) -> T | None:
+    def _next(self) -> list[T]:
+        """What waits, one frame of each source; empty when stopping."""
+
+        def ready() -> list[_Source[T]]:
+            return [queue for queue in self._sources if queue.waiting and not queue.held]
+
         with self._changed:
-            self._changed.wait_for(lambda: self._stopping or (self._waiting and not self._held))
-            return None if self._stopping else self._waiting.popleft()
+            self._changed.wait_for(lambda: self._stopping or ready())
+            return [] if self._stopping else [queue.waiting.popleft() for queue in ready()]
 
     def _run(self) -> None:
         try:
             self._prepare()
-            while (frame := self._next()) is not None:
-                self._work(frame)
+            with self._changed:
+                self._prepared = True
+                self._changed.notify_all()
+            while frames := self._next():
+                self._work(frames)
         except Exception as error:
-            self._failed(error)
+            with self._changed:
+                self.error = error
+                self._changed.notify_all()

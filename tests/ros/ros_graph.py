@@ -189,7 +189,7 @@ class Client:
         return message.header.stamp.sec
 
     def send_info(self, info: CameraInfo) -> None:
-        info.header = Header(frame_id="calibration")
+        info.header = Header(frame_id="optical")
         self.infos.publish(info)
 
     def result(self, stamp: int) -> dict[str, Any]:

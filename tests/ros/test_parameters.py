@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
-from rclpy.parameter import Parameter
 
-from dyfn_ros.parameters import SPECS, Settings, check, usage
+from dyfn_ros import parameter_docs
+from dyfn_ros.parameter_table import CONFIGURE, RUN, SPECS, START, Settings
+from dyfn_ros.parameters import check, check_cameras, usage
 
-CONFIG = Path(__file__).parents[2] / "config/stream_depth.yaml"
+ROOT = Path(__file__).parents[2]
 
 
 def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
-    content = yaml.safe_load(CONFIG.read_text())
+    content = yaml.safe_load((ROOT / "config/stream_depth.yaml").read_text())
     assert content == {
         "/**/stream_depth": {
             "ros__parameters": {name: spec.default for name, spec in SPECS.items()}
@@ -23,33 +25,82 @@ def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
     }
 
 
-def test_every_parameter_is_read_into_the_settings_with_its_type() -> None:
-    types = {field.name: field.type for field in fields(Settings)}
-    assert types == {name: type(spec.default).__name__ for name, spec in SPECS.items()}
+def test_manual_and_parameter_file_are_written_from_the_table() -> None:
+    """Run `python -m dyfn_ros.parameter_docs` after a change of the table."""
+    manual = (ROOT / "docs/node.md").read_text()
+    assert parameter_docs.updated_manual(manual) == manual
+    assert all(f"| `{name}`" in manual for name in SPECS)
+    file = (ROOT / "config/stream_depth.yaml").read_text()
+    assert parameter_docs.parameter_file() == file
+
+
+def test_a_manual_without_a_place_for_the_table_is_refused() -> None:
+    with pytest.raises(ValueError, match="lacks"):
+        parameter_docs.updated_manual("# no place")
+
+
+def test_every_default_has_the_type_of_its_field_and_lies_in_its_range() -> None:
+    defaults = Settings()
+    for field in fields(Settings):
+        spec = SPECS[field.name]
+        assert getattr(defaults, field.name) == spec.default
+        kind = "list[str]" if isinstance(spec.default, list) else type(spec.default).__name__
+        assert field.type == kind
+        assert spec.changes in (START, CONFIGURE, RUN)
+        assert not spec.choices or spec.default in spec.choices
+        if spec.range:
+            assert isinstance(spec.default, (int, float))
+            assert spec.range[0] <= spec.default <= spec.range[1]
 
 
 @pytest.mark.parametrize(
-    ("changes", "in_force", "allowed"),
+    ("changes", "in_force", "reason"),
     [
-        ({"min_depth": 1.0}, (0.0, 0.0), True),
-        ({"min_depth": 1.0}, (0.0, 2.0), True),
-        ({"min_depth": 2.0}, (0.0, 2.0), False),
-        ({"max_depth": 1.0}, (1.5, 0.0), False),
-        ({"max_depth": 0.0}, (1.5, 2.0), True),
-        ({"min_depth": 3.0, "max_depth": 4.0}, (0.0, 2.0), True),
-        ({"image_transport": "raw"}, (0.0, 0.0), True),
-        ({"image_transport": "RAW"}, (0.0, 0.0), False),
-        ({"reliability": "sometimes"}, (0.0, 0.0), False),
-        ({"use_sim_time": True}, (0.0, 0.0), True),
+        ({"min_depth": 1.0}, (0.0, 0.0), ""),
+        ({"min_depth": 1.0}, (0.0, 2.0), ""),
+        ({"min_depth": 2.0}, (0.0, 2.0), "must be below max_depth"),
+        ({"max_depth": 1.0}, (1.5, 0.0), "must be below max_depth"),
+        ({"max_depth": 0.0}, (1.5, 2.0), ""),
+        ({"min_depth": 3.0, "max_depth": 4.0}, (0.0, 2.0), ""),
+        ({"points_min_depth": 3.0, "points_max_depth": 3.0}, (0.0, 0.0), "points_max_depth"),
+        ({"image_transport": "raw"}, (0.0, 0.0), ""),
+        ({"image_transport": "RAW"}, (0.0, 0.0), "expected one of"),
+        ({"reliability": "sometimes"}, (0.0, 0.0), "expected one of"),
+        ({"use_sim_time": True}, (0.0, 0.0), ""),
     ],
 )
 def test_changes_are_allowed_together_or_refused(
-    changes: dict[str, object], in_force: tuple[float, float], allowed: bool
+    changes: dict[str, Any], in_force: tuple[float, float], reason: str
 ) -> None:
-    parameters = [Parameter(name, value=value) for name, value in changes.items()]
-    result = check(parameters, in_force)
-    assert result.successful is allowed
-    assert bool(result.reason) is not allowed
+    found = check(changes, dict(zip(("min_depth", "max_depth"), in_force, strict=True)))
+    assert reason in found
+    assert bool(reason) is bool(found)
+
+
+@pytest.mark.parametrize(("configured", "allowed"), [(False, True), (True, False)])
+def test_what_the_model_is_changes_only_while_unconfigured(configured: bool, allowed: bool) -> None:
+    assert (check({"model": "other"}, {}, configured) == "") is allowed
+    assert check({"stabilize": False}, {}, configured) == ""
+
+
+@pytest.mark.parametrize(
+    ("names", "reason"),
+    [
+        ([""], ""),
+        (["front", "left_2"], ""),
+        ([], "at least one"),
+        (["front", ""], "has ''"),
+        (["front/left"], "letters, digits"),
+        (["2nd"], "letters, digits"),
+        (["model"], "something else"),
+        (["depth"], "something else"),
+        (["a", "b", "a"], "twice"),
+    ],
+)
+def test_names_of_cameras_make_topics_or_are_refused(names: list[str], reason: str) -> None:
+    found = check_cameras(names)
+    assert reason in found
+    assert bool(reason) is bool(found)
 
 
 @pytest.mark.parametrize(
@@ -64,19 +115,7 @@ def test_changes_are_allowed_together_or_refused(
 def test_auto_reliability_follows_drop_frames(
     reliability: str, drop_frames: bool, reliable: bool
 ) -> None:
-    values = {name: spec.default for name, spec in SPECS.items()}
-    values.update(reliability=reliability, drop_frames=drop_frames)
-    assert Settings(**values).reliable is reliable  # type: ignore[arg-type]
-
-
-def test_the_manual_lists_every_parameter_as_it_is() -> None:
-    rows = [
-        f"| `{name}`{'*' if spec.read_only else ''} | {str(spec.default).lower()} "
-        f"| {spec.description} |"
-        for name, spec in SPECS.items()
-    ]
-    manual = (CONFIG.parents[1] / "docs/node.md").read_text()
-    assert [line for line in manual.splitlines() if line.startswith("| `")][-len(rows) :] == rows
+    assert Settings(reliability=reliability, drop_frames=drop_frames).reliable is reliable
 
 
 def test_help_shows_parameters_and_strange_arguments_are_refused(

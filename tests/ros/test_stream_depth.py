@@ -311,8 +311,10 @@ def test_range_limits_become_nan_in_depth_and_cloud(client: Client) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "reason"),
     [
-        ("model", "other", "read.only"),
-        ("drop_frames", True, "read.only"),
+        ("cameras", ["front"], "read.only"),
+        ("model", "other", "only while the node is unconfigured"),
+        ("drop_frames", True, "only while the node is unconfigured"),
+        ("distortion", "maybe", "expected one of"),
         ("num_tokens", -5, "range"),
         ("stabilize", "yes", "type"),
     ],
@@ -450,14 +452,14 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
 @pytest.mark.parametrize(
     ("parameters", "reason"),
     [
-        ({"model": "nothing"}, r"FATAL\].*model 'nothing' is unknown"),
+        ({"model": "nothing"}, r"ERROR\].*cannot configure.*model 'nothing' is unknown"),
         ({"image_transport": "theora"}, r"stream_depth: .*image_transport is 'theora', expected"),
         ({"queue_size": 0}, r"stream_depth: .*queue_size out of range"),
         ({"queue_size": "many"}, r"stream_depth: .*'queue_size'.*expecting type 'INTEGER'"),
         ({"remap": {"image": "a//b"}}, r"stream_depth: .*Couldn't parse remap rule"),
         (
             {"qos_overrides./image.subscription.reliability": "some"},
-            r"stream_depth: Unexpected QoS override for policy `reliability`: `some`",
+            r"cannot configure: Unexpected QoS override for policy `reliability`: `some`",
         ),
     ],
 )
@@ -473,13 +475,17 @@ def test_a_node_that_cannot_run_says_why_and_exits_with_one(
 def test_every_parameter_has_a_description(lossless: tuple[NodeProcess, Client]) -> None:
     from rcl_interfaces.srv import DescribeParameters
 
-    from dyfn_ros.parameters import SPECS
+    from dyfn_ros.parameter_table import SPECS, START
 
     client = lossless[1]
     service = client.node.create_client(DescribeParameters, f"{NODE}/describe_parameters")
     described = client._call(service, DescribeParameters.Request(names=list(SPECS))).descriptors
     assert [d.name for d in described] == list(SPECS)
     assert all(d.description for d in described)
+    assert {d.name for d in described if d.read_only} == {
+        name for name, spec in SPECS.items() if spec.changes == START
+    }
     types = {d.name: Parameter.Type(d.type) for d in described}
     assert types["model"] is Parameter.Type.STRING
+    assert types["cameras"] is Parameter.Type.STRING_ARRAY
     assert types["num_tokens"] is Parameter.Type.INTEGER

@@ -1,0 +1,112 @@
+"""What a CameraInfo does to an image: intrinsics, and the lens taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dyfn_ros.messages import Calibration, MessageError, decode_camera_info
+
+
+@dataclass(frozen=True)
+class View:
+    """An image as a pinhole camera sees it.
+
+    image: H x W x 3 uint8 RGB. matrix: 3 x 3 float64 pixels, None when unknown.
+    visible: H x W bool, False where undistortion had no pixel to take; None: all visible.
+    info: the CameraInfo that describes the image as it is now; None when there is none.
+    """
+
+    image: np.ndarray
+    matrix: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    info: Any = None
+
+
+@dataclass(frozen=True)
+class CalibrationRules:
+    """See the node's parameters of the same names."""
+
+    rectified: bool = False
+    distortion: str = "undistort"
+    check_frame_id: bool = True
+
+
+class Calibrator:
+    """Applies CameraInfos to the images of one camera; keeps the last undistortion.
+
+    warn: takes the reason when a CameraInfo is not used. Not for several threads at once.
+    """
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._key: tuple[Any, ...] | None = None
+        self._maps: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    def view(self, image: np.ndarray, frame_id: str, info: Any, rules: CalibrationRules) -> View:
+        """info: sensor_msgs/CameraInfo, or None.
+
+        Raises MessageError when the lens is distorted and that is refused, or is of a model that
+        cannot be undone. Another unusable info costs the intrinsics only, and a warning.
+        """
+        if info is None:
+            return View(image)
+        try:
+            if rules.check_frame_id:
+                _check_frame_id(frame_id, str(info.header.frame_id))
+            height, width = image.shape[:2]
+            calibration = decode_camera_info(info, height, width, rectified=rules.rectified)
+        except MessageError as error:
+            self._warn(f"{error}; going on without intrinsics")
+            return View(image)
+        if not calibration.distorted or rules.distortion == "ignore":
+            if calibration.distorted:
+                self._warn("the lens is distorted (D is not 0), which is ignored")
+            return View(image, calibration.matrix, info=info)
+        if rules.distortion == "refuse":
+            raise MessageError(
+                "the lens is distorted (D is not 0) and parameter distortion is refuse"
+            )
+        return self._undistorted(image, calibration)
+
+    def _undistorted(self, image: np.ndarray, calibration: Calibration) -> View:
+        key = (*calibration.matrix.reshape(-1), calibration.model, *calibration.d, *image.shape)
+        if key != self._key:
+            self._maps = undistortion(calibration, image.shape[0], image.shape[1])
+            self._key = key
+        columns, rows, visible = self._maps
+        flat = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return View(flat, calibration.matrix, visible)
+
+
+def _check_frame_id(image: str, info: str) -> None:
+    if image and info and image != info:
+        raise MessageError(f"frame_id is {info!r}, but the images have {image!r}")
+
+
+def undistortion(
+    calibration: Calibration, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Maps to the pinhole image with the same K: two H x W float32 (columns and rows of the
+    source pixels), and H x W bool where those are inside the image.
+
+    Raises MessageError for an unknown lens model.
+    """
+    matrix, d = calibration.matrix, np.asarray(calibration.d, np.float64)
+    size = (width, height)
+    if calibration.model in ("plumb_bob", "rational_polynomial") and d.size in (4, 5, 8, 12, 14):
+        maps = cv2.initUndistortRectifyMap(matrix, d, np.eye(3), matrix, size, cv2.CV_32FC1)
+    elif calibration.model in ("equidistant", "fisheye") and d.size == 4:
+        maps = cv2.fisheye.initUndistortRectifyMap(matrix, d, np.eye(3), matrix, size, cv2.CV_32FC1)
+    else:
+        raise MessageError(
+            f"the lens model {calibration.model!r} with {d.size} coefficients cannot be undone; "
+            "known: plumb_bob, rational_polynomial, equidistant"
+        )
+    columns, rows = maps
+    inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)
+    return columns, rows, inside

@@ -1,0 +1,207 @@
+"""One camera of the node: its topics, its calibration, its stream, its numbers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from dyfn_ros import messages
+from dyfn_ros.calibration import CalibrationRules, Calibrator, View
+from dyfn_ros.camera_stream import (
+    REQUESTED,
+    CameraStream,
+    Geometry,
+    StreamFrame,
+    StreamHook,
+    StreamMaker,
+    TimeRules,
+)
+from dyfn_ros.messages import MessageError
+from dyfn_ros.outputs import Outputs
+from dyfn_ros.parameter_table import Settings
+from dyfn_ros.ports import Ports
+from dyfn_ros.statistics import FrameStatistics
+
+_SENSOR_DEPTH = 5
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One image on its way to inference.
+
+    info: the newest CameraInfo when the image came. epoch: resets before it came, and request
+    the reason of the last one. arrived: time.monotonic().
+    """
+
+    camera: Camera
+    message: Any
+    info: Any
+    epoch: int
+    request: str
+    arrived: float
+
+
+def _no_model(key: Any) -> Any:
+    raise RuntimeError("the model is not loaded yet")
+
+
+class Camera:
+    """The callbacks only store and `submit`; the inference thread calls the other methods.
+
+    name: "" for a camera without a name of its own. settings: the values in force, asked for
+    each frame. submit: takes a Job, -> whether it was accepted. release: a CameraInfo has come.
+    warn: for what costs a frame its use.
+    """
+
+    def __init__(
+        self,
+        node: LifecycleNode,
+        ports: Ports,
+        name: str,
+        settings: Callable[[], Settings],
+        submit: Callable[[Job], bool],
+        release: Callable[[], None],
+        warn: Say,
+        error: Say,
+    ) -> None:
+        self.name = name
+        self.title = f"{node.get_name()}: {name}" if name else node.get_name()
+        self.statistics = FrameStatistics()
+        self.active = False
+        self.hooks: list[StreamHook] = []
+        self.stream = CameraStream(_no_model, hooks=self.hooks)
+        self.outputs = Outputs(ports, self.prefix, not settings().drop_frames)
+        self._node, self._settings = node, settings
+        self._submit, self._release, self._warn, self._error = submit, release, warn, error
+        self._info: CameraInfo | None = None
+        self._epoch, self._request = 0, REQUESTED
+        self._epoch_lock = threading.Lock()
+        self._subscribe(ports)
+        self._calibrator = Calibrator(lambda text: warn(f"{self.info_topic}: {text}"))
+
+    @property
+    def prefix(self) -> str:
+        """Before the names of its topics and services."""
+        return f"{self.name}/" if self.name else ""
+
+    @property
+    def settings(self) -> Settings:
+        """The values in force."""
+        return self._settings()
+
+    def _subscribe(self, ports: Ports) -> None:
+        settings = self.settings
+        kind = ReliabilityPolicy.RELIABLE if settings.reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(
+            depth=_SENSOR_DEPTH if settings.drop_frames else settings.queue_size,
+            history=HistoryPolicy.KEEP_LAST,
+            reliability=kind,
+        )
+        topic = f"{self.prefix}image"
+        if settings.image_transport == "compressed":
+            # Beside the image topic, also when that is remapped, as image_transport has it.
+            topic = f"{self._node.resolve_topic_name(topic)}/compressed"
+            images = ports.subscription(CompressedImage, topic, self._on_image, qos)
+        else:
+            images = ports.subscription(Image, topic, self._on_image, qos)
+        infos = ports.subscription(CameraInfo, f"{self.prefix}camera_info", self._on_info, qos)
+        self.image_topic, self.info_topic = images.topic_name, infos.topic_name
+
+    # Executor's thread: nothing here waits for inference.
+
+    def _on_info(self, info: CameraInfo) -> None:
+        self._info = info
+        self._release()
+
+    def _on_image(self, message: Any) -> None:
+        self.statistics.count("received" if self.active else "inactive")
+        if not self.active:
+            return
+        now = time.monotonic()
+        with self._epoch_lock:
+            job = Job(self, message, self._info, self._epoch, self._request, now)
+        if not self._submit(job):
+            self._error(
+                f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
+                "full, newer frames are lost; play slower or raise it",
+            )
+
+    def request_reset(self, reason: str) -> None:
+        """Frames that came before this call never touch the state after it. Any thread."""
+        with self._epoch_lock:
+            self._epoch, self._request = self._epoch + 1, reason
+
+    # Inference thread.
+
+    def open_stream(self, make: StreamMaker) -> None:
+        """Once, before the first frame."""
+        self.stream.make = make
+
+    def decode(self, job: Job) -> tuple[StreamFrame, View]:
+        """Raises MessageError when the image, or its lens, cannot be used."""
+        settings = self.settings
+        compressed = settings.image_transport == "compressed"
+        decode = messages.decode_compressed if compressed else messages.decode_image
+        image = decode(job.message)
+        header = job.message.header
+        view = self._calibrator.view(
+            image,
+            header.frame_id,
+            job.info or self._info,
+            CalibrationRules(settings.rectified, settings.distortion, settings.check_frame_id),
+        )
+        frame = StreamFrame(
+            image=view.image,
+            camera_matrix=view.matrix,
+            visible=view.visible,
+            stamp=header.stamp.sec + header.stamp.nanosec * 1e-9,
+            frame_id=header.frame_id,
+            stabilize=settings.stabilize,
+            num_tokens=settings.num_tokens,
+            epoch=job.epoch,
+            request=job.request,
+        )
+        return frame, view
+
+    def begin(self, frame: StreamFrame) -> Any:
+        """-> the DepthStream that the frame goes into."""
+        settings = self.settings
+        self.stream.rules = TimeRules(settings.stamp_tolerance, settings.max_gap)
+        return self.stream.begin(frame)
+
+    def publish(self, job: Job, view: View, geometry: Geometry) -> None:
+        """Everything that somebody wants of a finished frame."""
+        header = job.message.header
+        if geometry.reset:
+            counts = dict(self.stream.resets)
+            self.outputs.publish_reset(header, self.title, geometry.reset, counts)
+        self.outputs.publish(header, view.image, geometry, view.info, self.settings)
+        stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        self.statistics.published(
+            (self._node.get_clock().now().nanoseconds - stamp) * 1e-9,
+            time.monotonic() - job.arrived,
+        )
+
+    def bad(self, job: Job, error: MessageError) -> None:
+        """The job's image cannot be used."""
+        self.statistics.count("bad")
+        self._warn(f"{self.image_topic}: {error}")
+
+    def failed(self, job: Job, error: Exception) -> None:
+        """The network, or publishing, failed on the job."""
+        self.stream.fail()
+        if not self._node.context.ok():  # shut down under our feet: nobody to publish to
+            self.statistics.count("unpublished")
+            return
+        self.statistics.count("failed")
+        text = f"{self.image_topic}: inference failed, the stream starts anew"
+        self._error(f"{text}: {type(error).__name__}: {error}")

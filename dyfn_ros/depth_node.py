@@ -1,0 +1,294 @@
+"""The lifecycle node `stream_depth`: several cameras, one model, one inference thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import JumpThreshold, TimeJump
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import QoSProfile
+from std_srvs.srv import Trigger
+
+from dyfn_ros.camera import Camera, Job
+from dyfn_ros.camera_stream import REQUESTED, TIME_JUMP, stream_maker
+from dyfn_ros.diagnostics import Report, node_diagnostics
+from dyfn_ros.inference import run_jobs
+from dyfn_ros.parameter_table import Settings
+from dyfn_ros.parameters import NodeParameters
+from dyfn_ros.ports import Ports
+from dyfn_ros.throttle import Throttle
+from dyfn_ros.worker import FrameWorker
+
+if TYPE_CHECKING:
+    from dyfn_core.models.base import GeometryModel
+
+ModelLoader = Callable[[str, str], "GeometryModel"]
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+_PATIENCE = 4.0  # seconds; ROS launch loses its own after 5
+_POLL = 0.1  # seconds between looks at the context while the model is loaded
+
+
+def load_bundled(name: str, device: str) -> GeometryModel:
+    """load_model, with its imports (seconds) made where nobody waits for them."""
+    from dyfn_core.models import load_model
+
+    return load_model(name, device=device)
+
+
+class StreamDepthNode(LifecycleNode):
+    """Topics, services, parameters and states: docs/node.md.
+
+    Callbacks only store and queue; decoding, inference and publishing happen in one worker
+    thread, which lives from configure to cleanup.
+    """
+
+    def __init__(self, load: ModelLoader = load_bundled, **node_options: Any) -> None:
+        super().__init__("stream_depth", **node_options)
+        self._load = load
+        self._throttle = Throttle()
+        self._phase = "unconfigured"
+        self._device = ""
+        self._worker: FrameWorker[Job] | None = None
+        self._cameras: list[Camera] = []
+        self._made: list[Callable[[], Any]] = []  # what cleanup undoes
+        self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
+        self._ports = Ports(self, self._warn)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+        )
+
+    @property
+    def settings(self) -> Settings:
+        """The values in force."""
+        return self._table.settings
+
+    @property
+    def worker_error(self) -> BaseException | None:
+        """What the worker ended with, when it has ended by itself."""
+        return None if self._worker is None else self._worker.error
+
+    def _warn(self, text: str) -> None:
+        if line := self._throttle(text):
+            self.get_logger().warning(line)
+
+    def _error(self, text: str) -> None:
+        if line := self._throttle(text):
+            self.get_logger().error(line)
+
+    # Transitions.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Topics, services, and the model, which is loaded while this waits."""
+        try:
+            return self._configure(state)
+        except Exception as error:  # rclpy goes to on_error without a word
+            self.get_logger().error(f"cannot configure: {error}")
+            raise
+
+    def _configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        settings = self.settings
+        self._worker = FrameWorker(
+            lambda jobs: run_jobs(jobs, self.settings.batch),
+            prepare=self._load_model,
+            keep_all=not settings.drop_frames,
+            capacity=settings.queue_size,
+            held=[self._table.camera(name).wait_for_camera_info for name in settings.cameras],
+        )
+        self._cameras = [self._make_camera(i, name) for i, name in enumerate(settings.cameras)]
+        self._make_services()
+        self._worker.start()
+        while self.context.ok() and not self._worker.wait_prepared(_POLL):
+            pass
+        if self._worker.error is not None or not self.context.ok():
+            self.get_logger().error(f"cannot configure: {self._worker.error!r}")
+            self._release_all()
+            return FAILURE
+        self._phase = "inactive"
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Frames that come from now on are worked on."""
+        result = super().on_activate(state)
+        if result == SUCCESS:
+            self._phase = "active"
+            self._set_active(True)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Drop what waits and publish nothing more; the streams keep their memory."""
+        self._set_active(False)
+        self._phase = "inactive"
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give the model, the topics and the memory back."""
+        self._release_all()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As cleanup; the node cannot be configured again."""
+        self._release_all()
+        self._phase = "finalized"
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """A transition raised: back to unconfigured with nothing left over."""
+        self.get_logger().error(f"a transition from {state.label} failed")
+        self._release_all()
+        return SUCCESS
+
+    def _set_active(self, active: bool) -> None:
+        for index, camera in enumerate(self._cameras):
+            camera.active = active
+            if not active and self._worker is not None:
+                self._worker.discard(index)
+
+    def _release_all(self) -> tuple[list[str], bool]:
+        """-> the last words, said already if there is a context, and whether the worker ended."""
+        self._set_active(False)
+        done = self._worker is None or self._worker.stop(_PATIENCE)
+        for undo in reversed(self._made):
+            undo()
+        self._made = []
+        self._ports.close()
+        lines = self._summary()
+        for line in lines if self.context.ok() else []:
+            self.get_logger().info(line)
+        self._cameras, self._worker = [], None
+        self._phase = "unconfigured"
+        return lines, done
+
+    # What a configured node is made of.
+
+    def _make_camera(self, index: int, name: str) -> Camera:
+        worker = self._worker
+        assert worker is not None
+        return Camera(
+            self,
+            self._ports,
+            name,
+            partial(self._table.camera, name),
+            submit=lambda job: worker.submit(job, index),
+            release=lambda: worker.release(index),
+            warn=self._warn,
+            error=self._error,
+        )
+
+    def _make_services(self) -> None:
+        """Trigger services, the clock's jump callback, and the timer of the diagnostics."""
+        everyone = list(range(len(self._cameras)))
+        topics = {"~/reset": everyone}
+        topics.update({f"~/{c.name}/reset": [i] for i, c in enumerate(self._cameras) if c.name})
+        for topic, indices in topics.items():
+            service = self.create_service(Trigger, topic, partial(self._on_reset, indices))
+            self._made.append(partial(self.destroy_service, service))
+        self._made.append(self._watch_clock().unregister)
+        period = self.settings.diagnostics_period
+        timer = self.create_timer(
+            period, self.publish_diagnostics, MutuallyExclusiveCallbackGroup()
+        )
+        self._made.append(partial(self.destroy_timer, timer))
+
+    def _watch_clock(self) -> Any:
+        """Jumps of ROS time (use_sim_time); a looping bag without a clock shows in stamps only."""
+        threshold = JumpThreshold(
+            min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1)
+        )
+        return self.get_clock().create_jump_callback(threshold, post_callback=self._on_jump)
+
+    # Executor's thread.
+
+    def _on_jump(self, jump: TimeJump) -> None:
+        seconds = jump.delta.nanoseconds * 1e-9
+        for index, camera in enumerate(self._cameras):
+            settings = camera.settings
+            forward = bool(settings.max_gap) and seconds > settings.max_gap
+            if seconds < -settings.stamp_tolerance or forward:
+                self._reset(index, TIME_JUMP)
+
+    def _on_reset(
+        self, indices: list[int], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        dropped = sum(self._reset(index, REQUESTED) for index in indices)
+        response.success = True
+        response.message = f"the next frame starts anew ({dropped} waiting frames dropped)"
+        self.get_logger().info(f"reset: {response.message}")
+        return response
+
+    def _reset(self, index: int, reason: str) -> int:
+        """-> how many waiting frames were dropped."""
+        self._cameras[index].request_reset(reason)
+        if self._worker is None or not self.settings.drop_frames:
+            return 0
+        return self._worker.discard(index)
+
+    def publish_diagnostics(self) -> None:
+        """One status for the node and one for each camera."""
+        if self._diagnostics.get_subscription_count() == 0:
+            return
+        report = Report(
+            name=self.get_name(),
+            phase=self._phase,
+            settings=self.settings,
+            device=self._device,
+            error=self.worker_error,
+            mismatches=self._ports.mismatches,
+            cameras=self._cameras,
+            dropped=[self._dropped(index) for index in range(len(self._cameras))],
+        )
+        message = node_diagnostics(report)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    # Inference thread.
+
+    def _load_model(self) -> None:
+        import torch
+
+        settings = self.settings
+        if settings.threads:
+            torch.set_num_threads(settings.threads)
+        device = settings.device
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        make = stream_maker(self._load(settings.model, device))
+        for camera in self._cameras:
+            camera.open_stream(make)
+        self._device = device
+        if self.context.ok():  # loading takes long enough to be interrupted
+            self.get_logger().info(
+                f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
+            )
+
+    # The end.
+
+    def _dropped(self, index: int) -> int:
+        return 0 if self._worker is None else self._worker.dropped(index)
+
+    def _summary(self) -> list[str]:
+        """What became of the frames of each camera."""
+        lines = []
+        for index, camera in enumerate(self._cameras):
+            counts = camera.statistics.counts
+            lines.append(
+                f"{camera.name + ': ' if camera.name else ''}{counts['received']} frames received, "
+                f"{counts['published']} worked on, "
+                f"{self._dropped(index) + counts['unpublished']} dropped, {counts['bad']} bad, "
+                f"{counts['failed']} failed; {sum(camera.stream.resets.values())} resets"
+            )
+        return lines
+
+    def close(self) -> bool:
+        """Release everything and say what became of the frames. -> whether the worker is done."""
+        logger, ended = self.get_logger(), not self.context.ok()
+        lines, done = self._release_all()
+        self.destroy_node()  # first: a signal has ended the context that rosout needs
+        for line in lines if ended else []:
+            logger.info(line)
+        return done

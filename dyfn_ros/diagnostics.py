@@ -1,0 +1,111 @@
+"""What /diagnostics says: one status for the node and one for each camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from dyfn_ros.camera import Camera
+from dyfn_ros.parameter_table import Settings
+from dyfn_ros.statistics import Snapshot
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+@dataclass(frozen=True)
+class Report:
+    """What is known at one moment.
+
+    phase: lifecycle state. mismatches: incompatible QoS by topic. dropped: frames per camera.
+    """
+
+    name: str
+    phase: str
+    settings: Settings
+    device: str
+    error: BaseException | None
+    mismatches: Mapping[str, str]
+    cameras: Sequence[Camera]
+    dropped: Sequence[int]
+
+
+def node_diagnostics(report: Report) -> DiagnosticArray:
+    """Without a stamp; takes a snapshot of each camera's statistics."""
+    cameras = zip(report.cameras, report.dropped, strict=True)
+    return DiagnosticArray(
+        status=[_node(report), *(_camera(report, camera, dropped) for camera, dropped in cameras)]
+    )
+
+
+def _status(
+    name: str, problems: Sequence[tuple[bytes, str]], fine: str, values: Mapping[str, str]
+) -> DiagnosticStatus:
+    """The worst problem's level and all problems' texts."""
+    return DiagnosticStatus(
+        level=max([level for level, _ in problems], default=OK),
+        name=name,
+        message="; ".join(text for _, text in problems) or fine,
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
+
+
+def _node(report: Report) -> DiagnosticStatus:
+    problems = [
+        (WARN, f"{topic}: {mismatch}") for topic, mismatch in sorted(report.mismatches.items())
+    ]
+    if report.error is not None:
+        problems.insert(0, (ERROR, f"inference has ended: {report.error!r}"))
+    values = {
+        "state": report.phase,
+        "model": report.settings.model,
+        "device": report.device,
+        "stabilizer": "on" if report.settings.stabilize else "off",
+        "cameras": str(len(report.cameras)),
+    }
+    values.update({f"incompatible QoS {t}": m for t, m in sorted(report.mismatches.items())})
+    return _status(report.name, problems, report.phase, values)
+
+
+def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
+    snapshot = camera.statistics.snapshot()
+    values = {
+        "image topic": camera.image_topic,
+        "input rate": f"{snapshot.input_rate:.2f} Hz",
+        "output rate": f"{snapshot.output_rate:.2f} Hz",
+        **_milliseconds("latency", snapshot.latency if snapshot.same_clock else None),
+        **_milliseconds("processing", snapshot.processing),
+        "dropped": str(dropped + snapshot.counts.get("unpublished", 0)),
+    }
+    for key in ("received", "published", "bad", "failed"):
+        values[key] = str(snapshot.counts.get(key, 0))
+    resets = dict(camera.stream.resets)
+    values["resets"] = str(sum(resets.values()))
+    values.update({f"resets: {reason}": str(count) for reason, count in resets.items()})
+    for hook in camera.hooks:
+        values.update(hook.report())
+    problems = _camera_problems(report, camera, snapshot)
+    return _status(f"{report.name}: {camera.name or 'camera'}", problems, report.phase, values)
+
+
+def _milliseconds(name: str, seconds: tuple[float, float] | None) -> dict[str, str]:
+    if seconds is None:
+        return {f"{name} p50": "unknown", f"{name} p99": "unknown"}
+    return {
+        f"{name} {which}": f"{value * 1e3:.1f} ms"
+        for which, value in zip(("p50", "p99"), seconds, strict=True)
+    }
+
+
+def _camera_problems(report: Report, camera: Camera, snapshot: Snapshot) -> list[tuple[bytes, str]]:
+    problems = []
+    if failed := snapshot.recent.get("failed"):
+        problems.append((ERROR, f"inference failed on {failed} frames"))
+    if bad := snapshot.recent.get("bad"):
+        problems.append((ERROR, f"{bad} images on {camera.image_topic} could not be used"))
+    if report.phase == "active" and not snapshot.recent.get("received"):
+        problems.append((WARN, f"no images on {camera.image_topic}"))
+    if not snapshot.same_clock:
+        problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
+    return problems

@@ -1,0 +1,89 @@
+"""The frames of all cameras through one model, those that wait together in one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from dyfn_ros.calibration import View
+from dyfn_ros.camera import Job
+from dyfn_ros.camera_stream import StreamFrame
+from dyfn_ros.messages import MessageError
+
+if TYPE_CHECKING:
+    from dyfn_core.prediction import Prediction
+    from dyfn_core.stream import DepthStream
+
+
+@dataclass(frozen=True)
+class _Begun:
+    job: Job
+    frame: StreamFrame
+    view: View
+    stream: DepthStream
+
+
+def run_jobs(jobs: Sequence[Job], batch: bool) -> None:
+    """One job of each camera: decode, infer, publish. What goes wrong costs that job only.
+
+    batch: run frames of equal size and settings together.
+    """
+    groups: dict[Any, list[_Begun]] = {}
+    for job in jobs:
+        begun = _begin(job)
+        if begun is not None:
+            frame = begun.frame
+            kind: Any = (frame.image.shape, frame.num_tokens, frame.stabilize) if batch else job
+            groups.setdefault(kind, []).append(begun)
+    for group in groups.values():
+        _run_group(group)
+
+
+def _begin(job: Job) -> _Begun | None:
+    try:
+        frame, view = job.camera.decode(job)
+        return _Begun(job, frame, view, job.camera.begin(frame))
+    except MessageError as error:
+        job.camera.bad(job, error)
+    except Exception as error:
+        job.camera.failed(job, error)
+    return None
+
+
+def _run_group(group: list[_Begun]) -> None:
+    try:
+        predictions = _predict(group)
+    except Exception as error:
+        if len(group) == 1:
+            group[0].job.camera.failed(group[0].job, error)
+            return
+        for one in group:  # the others must not pay for the one that fails
+            _run_group([one])
+        return
+    for one, prediction in zip(group, predictions, strict=True):
+        _publish(one, prediction)
+
+
+def _predict(group: list[_Begun]) -> list[Prediction]:
+    """Raises what the network raises; the streams are then as they were."""
+    from dyfn_core.stream import push_together
+
+    streams = [one.stream for one in group]
+    memories = [stream.memory for stream in streams]
+    try:
+        return push_together(
+            streams, [one.frame.image for one in group], [one.frame.stamp for one in group]
+        )
+    except Exception:
+        for stream, memory in zip(streams, memories, strict=True):
+            stream.memory = memory
+        raise
+
+
+def _publish(one: _Begun, prediction: Prediction) -> None:
+    camera = one.job.camera
+    try:
+        camera.publish(one.job, one.view, camera.stream.end(one.frame, prediction))
+    except Exception as error:
+        camera.failed(one.job, error)

@@ -1,0 +1,261 @@
+"""The node's parameters: the one table that declarations, manual and parameter file come from."""
+
+# ruff: noqa: RUF009  (_parameter only describes a field)
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+Value = str | bool | int | float | list[str]
+
+START = "start"  # read only
+CONFIGURE = "configure"  # while the node is unconfigured
+RUN = "run"  # at any time
+MARKS = {START: "*", CONFIGURE: "+", RUN: ""}
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One parameter.
+
+    group: heading in the manual. changes: START, CONFIGURE or RUN. per_camera: a named camera may
+    have a value of its own, `CAMERA.NAME`. range: both ends are allowed. choices: for strings.
+    """
+
+    default: Value
+    description: str
+    group: str
+    changes: str = CONFIGURE
+    per_camera: bool = False
+    range: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+
+
+def _parameter(group: str, default: Value, description: str, **options: Any) -> Any:
+    spec = Spec(default, description, group, **options)
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata={"spec": spec})
+    return field(default=default, metadata={"spec": spec})
+
+
+_NODE, _INPUT, _STREAM, _OUTPUT, _CLOUD = "Node", "Input", "Stream", "Output", "Cloud"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The values in force; a new one for each change. The fields are the table."""
+
+    cameras: list[str] = _parameter(
+        _NODE,
+        [""],
+        "Names of the cameras. Camera NAME has the topics `NAME/image`, `NAME/camera_info` and "
+        "`~/NAME/...`; one empty name is a single camera without these prefixes.",
+        changes=START,
+    )
+    autostart: bool = _parameter(
+        _NODE,
+        True,
+        "Configure and activate at start. False: wait for a lifecycle manager.",
+        changes=START,
+    )
+    model: str = _parameter(_NODE, "dyfn-mini", "Bundled model's name, checkpoint file, or Hub id.")
+    device: str = _parameter(
+        _NODE, "auto", "Where to run: auto (a GPU if there is one), cpu, cuda, cuda:N."
+    )
+    threads: int = _parameter(
+        _NODE, 0, "CPU threads for inference; 0 leaves the default.", range=(0, 1024)
+    )
+    batch: bool = _parameter(
+        _NODE,
+        True,
+        "Frames of several cameras that wait together, of one size, run as one batch. False: one "
+        "after the other, which gives each camera the very bytes it would get alone.",
+        changes=RUN,
+    )
+    diagnostics_period: float = _parameter(
+        _NODE, 1.0, "Seconds between two messages on /diagnostics.", range=(0.05, 3600.0)
+    )
+
+    image_transport: str = _parameter(
+        _INPUT,
+        "raw",
+        "raw subscribes `image`, compressed subscribes `image/compressed`.",
+        per_camera=True,
+        choices=("raw", "compressed"),
+    )
+    reliability: str = _parameter(
+        _INPUT,
+        "auto",
+        "Of the subscriptions; auto is reliable when drop_frames is false, else best effort, "
+        "which every camera driver matches.",
+        per_camera=True,
+        choices=("auto", "best_effort", "reliable"),
+    )
+    drop_frames: bool = _parameter(
+        _INPUT,
+        True,
+        "Work on the latest frame and drop those that came meanwhile. False: queue and work on "
+        "every frame in order, for recordings.",
+    )
+    queue_size: int = _parameter(
+        _INPUT,
+        1000,
+        "Frames of one camera that may wait when drop_frames is false.",
+        range=(1, 1_000_000),
+    )
+    wait_for_camera_info: bool = _parameter(
+        _INPUT,
+        False,
+        "Hold the first frames until a CameraInfo has come, so that all have intrinsics.",
+        per_camera=True,
+    )
+    rectified: bool = _parameter(
+        _INPUT,
+        False,
+        "The images are rectified: take P of the CameraInfo instead of K and D.",
+        changes=RUN,
+        per_camera=True,
+    )
+    distortion: str = _parameter(
+        _INPUT,
+        "undistort",
+        "When D is not 0. undistort: outputs are those of the undistorted image with the same K. "
+        "refuse: such images are errors. ignore: take K as if D were 0.",
+        changes=RUN,
+        per_camera=True,
+        choices=("undistort", "refuse", "ignore"),
+    )
+    check_frame_id: bool = _parameter(
+        _INPUT,
+        True,
+        "Do not use a CameraInfo whose frame_id is another than the image's.",
+        changes=RUN,
+        per_camera=True,
+    )
+
+    stabilize: bool = _parameter(
+        _STREAM,
+        True,
+        "Use DyFN. A change starts the stream anew.",
+        changes=RUN,
+        per_camera=True,
+    )
+    num_tokens: int = _parameter(
+        _STREAM,
+        0,
+        "Resolution inside the model; 0 is the model's own. A change starts the stream anew.",
+        changes=RUN,
+        per_camera=True,
+        range=(0, 100_000),
+    )
+    stamp_tolerance: float = _parameter(
+        _STREAM,
+        0.2,
+        "Seconds that a stamp (or ROS time) may go back before the stream starts anew.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+    max_gap: float = _parameter(
+        _STREAM,
+        5.0,
+        "Seconds from one frame's stamp to the next (or a jump of ROS time) beyond which the "
+        "stream starts anew; 0 is no limit.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+
+    publish_depth: bool = _parameter(
+        _OUTPUT, True, "Publish ~/depth/... when somebody subscribes.", changes=RUN, per_camera=True
+    )
+    publish_points: bool = _parameter(
+        _OUTPUT, True, "Publish ~/points when somebody subscribes.", changes=RUN, per_camera=True
+    )
+    depth_encoding: str = _parameter(
+        _OUTPUT,
+        "32FC1",
+        "Of ~/depth/image: 32FC1 with NaN where there is none, or 16UC1 in thousandths with 0.",
+        changes=RUN,
+        per_camera=True,
+        choices=("32FC1", "16UC1"),
+    )
+    min_depth: float = _parameter(
+        _OUTPUT,
+        0.0,
+        "Nearer points become NaN; in the unit of the output depth.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+    max_depth: float = _parameter(
+        _OUTPUT,
+        0.0,
+        "Farther points become NaN; in the unit of the output depth; 0 is no limit.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+
+    points_stride: int = _parameter(
+        _CLOUD,
+        1,
+        "Every so many rows and columns of the image give a point.",
+        changes=RUN,
+        per_camera=True,
+        range=(1, 64),
+    )
+    points_min_depth: float = _parameter(
+        _CLOUD,
+        0.0,
+        "As min_depth, for the cloud alone.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+    points_max_depth: float = _parameter(
+        _CLOUD,
+        0.0,
+        "As max_depth, for the cloud alone.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1e6),
+    )
+    points_edge_filter: float = _parameter(
+        _CLOUD,
+        0.0,
+        "Flying pixels: a point whose depth differs from a neighbour pixel's by more than this "
+        "share becomes NaN; 0 keeps all, 0.05 is usual.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 10.0),
+    )
+
+    @property
+    def reliable(self) -> bool:
+        """Whether subscriptions ask for reliable delivery."""
+        if self.reliability == "auto":
+            return not self.drop_frames
+        return self.reliability == "reliable"
+
+
+SPECS: dict[str, Spec] = {entry.name: entry.metadata["spec"] for entry in fields(Settings)}
+
+# Pairs of a lower and an upper limit; an upper limit of 0 is none.
+LIMITS = (("min_depth", "max_depth"), ("points_min_depth", "points_max_depth"))
+
+
+def show(value: Any) -> str:
+    """A default as YAML has it."""
+    if isinstance(value, list):
+        return f"[{', '.join(repr(item) for item in value)}]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def groups() -> dict[str, dict[str, Spec]]:
+    """The table by heading, in order."""
+    result: dict[str, dict[str, Spec]] = {}
+    for name, spec in SPECS.items():
+        result.setdefault(spec.group, {})[name] = spec
+    return result
