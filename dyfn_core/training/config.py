@@ -177,7 +177,8 @@ class StabilizerRunConfig(RunConfig):
 
     base: a checkpoint of type mini. stabilizer: fields of StabilizerConfig. warm_start: go on from
     the base's own DyFN instead of a fresh one. cache: folder of
-    encoded clips (default: OUT/latents); cache_draws: batches of `stages[0].batch` clips in it;
+    encoded clips (default: OUT/latents); cache_draws: batches of `stages[0].batch` clips in it, 0 for no
+    cache: every step then encodes clips of its own; cache_seed: of its draws (default: `seed`);
     cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
     length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
     loss. The four weights: L_align from the first frame and from all, L_temp, and each frame's
@@ -190,7 +191,8 @@ class StabilizerRunConfig(RunConfig):
     stabilizer: dict[str, Any] = Field(default_factory=dict)
     warm_start: bool = False
     cache: Path | None = None
-    cache_draws: int = Field(200, ge=1)
+    cache_draws: int = Field(200, ge=0)
+    cache_seed: int | None = None
     cache_length: int = Field(32, ge=2)
     strides: tuple[int, int] = (3, 8)
     clips: int = Field(4, ge=1)

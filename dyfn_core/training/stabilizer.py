@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyfn_core.data.clips import draw_batch, find_sequences
+from dyfn_core.data.clips import batch_loader, draw_batch, find_sequences
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import target_from_depth
@@ -44,8 +44,12 @@ class StabilizerTask(Task):
         self.config = config
         self.model = build_frozen(config).to(device)
         self.source = clip_source(config, config.cache_length, config.strides)
-        folder = config.cache or cache_folder
-        self.cache = LatentCache(folder, self.model, self.source, config.cache_draws)
+        if config.cache_seed is not None:
+            self.source = replace(self.source, seed=config.cache_seed)
+        self.cache: LatentCache | None = None
+        if config.cache_draws:
+            folder = config.cache or cache_folder
+            self.cache = LatentCache(folder, self.model, self.source, config.cache_draws)
         self.sequences: dict[str, list[Sequence]] = {}
 
     def groups(self) -> list[dict[str, Any]]:
@@ -56,7 +60,11 @@ class StabilizerTask(Task):
     def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[LatentClips]:
         clips = share_of(self.config.clips, parts, "clips")
         seed = part_seed(self.config.seed, part)
-        return self.cache.batches(start, seed, clips, self.config.length)
+        if self.cache is not None:
+            return self.cache.batches(start, seed, clips, self.config.length)
+        stages = tuple(replace(stage, batch=clips) for stage in self.source.stages)
+        source = replace(self.source, length=self.config.length, stages=stages, seed=seed)
+        return (encode_clips(self.model, batch) for batch in batch_loader(source, start))
 
     def images(self, batch: LatentClips) -> int:
         return batch.latent.shape[0] * batch.latent.shape[1]
