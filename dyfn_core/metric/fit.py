@@ -62,7 +62,7 @@ def robust_centre(values: np.ndarray) -> tuple[float, float, np.ndarray]:
     for _ in range(3):
         kept = np.abs(values - centre) <= _KEPT * sigma
         centre = float(values[kept].mean())
-        # With 40% outliers the half is nearly all of the inliers: first is then up to 3 times too wide.
+        # Of 40% outliers the half holds nearly all inliers: first is then 3 times too wide.
         sigma = max(1.05 * float(values[kept].std()), first / 2)
     return centre, sigma, np.abs(values - centre) <= _KEPT * sigma
 

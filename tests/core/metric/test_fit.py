@@ -91,7 +91,7 @@ def test_too_few_points_are_no_fit(fit) -> None:  # type: ignore[no-untyped-def]
 def test_points_without_a_common_scale_are_no_fit() -> None:
     predicted = np.ones(12)
     measured = np.geomspace(0.01, 100, 12)
-    with pytest.raises(NoFitError, match="agree on one scale|spread by"):
+    with pytest.raises(NoFitError, match=r"agree on one scale|spread by"):
         fit_scale(predicted, measured)
 
 

@@ -1,0 +1,204 @@
+"""A stream's complete memory in one safetensors file, to go on with after a restart."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from dyfn_core.metric.calibration import Calibration
+from dyfn_core.metric.fit import MetricMap
+from dyfn_core.metric.references import Evidence
+from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.checkpoints import full_config
+from dyfn_core.prediction import StreamState
+from dyfn_core.stream import DepthStream, StreamMemory, Track
+from dyfn_core.streaming.plain_values import PlainError, from_plain, to_plain
+from dyfn_core.streaming.scene_cut import CutState, Look
+
+FORMAT = "dyfn-stream 1"
+
+
+class StateFileError(ValueError):
+    """A state file that cannot be read, or that belongs to something else; the text says what."""
+
+
+@dataclass(frozen=True)
+class SavedStream:
+    """What a state file holds.
+
+    memory: the DepthStream's. camera_matrix: 3 x 3 float64 pixels, or None.
+    calibration: of the metric scale; cut: of the scene cut detector; None when there is none.
+    options: what the stream was made with. notes: the caller's own, text to text.
+    """
+
+    memory: StreamMemory
+    camera_matrix: np.ndarray | None
+    calibration: Calibration | None = None
+    cut: CutState | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+_KINDS: dict[str, type] = {
+    kind.__name__: kind
+    for kind in (
+        SavedStream,
+        StreamMemory,
+        StreamState,
+        Track,
+        Calibration,
+        MetricMap,
+        Evidence,
+        CutState,
+        Look,
+    )
+}
+
+
+def model_fingerprint(model: GeometryModel) -> str:
+    """SHA-256 of a model's configuration and weights; a different one is a different model."""
+    digest = hashlib.sha256(json.dumps(full_config(model), sort_keys=True).encode())
+    for name, value in sorted(model.state_dict().items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def stream_options(stream: DepthStream) -> dict[str, Any]:
+    """What two streams must share for one to go on with the memory of the other."""
+    filters = {"shift_filter": stream.shift_filter, "focal_filter": stream.focal_filter}
+    return {
+        "stabilize": stream.stabilize,
+        "num_tokens": stream.num_tokens,
+        "shift_mode": stream.shift_mode,
+        "force_projection": stream.force_projection,
+        **{name: [one.gain, one.clip] for name, one in filters.items()},
+    }
+
+
+def save_stream(
+    path: str | Path,
+    stream: DepthStream,
+    fingerprint: str,
+    *,
+    calibration: Calibration | None = None,
+    cut: CutState | None = None,
+    notes: Mapping[str, str] | None = None,
+) -> None:
+    """Write a stream's state, whole or not at all: a file of that name stays until it is.
+
+    fingerprint: model_fingerprint of the stream's model.
+    Raises OSError (no such folder, disk full); the old file is then as it was.
+    """
+    saved = SavedStream(
+        stream.memory,
+        stream.camera_matrix,
+        calibration,
+        cut,
+        stream_options(stream),
+        dict(notes or {}),
+    )
+    tensors: dict[str, Tensor] = {}
+    content = json.dumps(
+        {"model": fingerprint, "state": to_plain(saved, tensors, _KINDS)}, sort_keys=True
+    )
+    metadata = {"format": FORMAT, "content": content, "digest": _digest(content, tensors)}
+    write_whole(Path(path), save_tensors(tensors, metadata))
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Replace a file in one step: readers see the old content or the new. Raises OSError."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load_stream(path: str | Path, fingerprint: str) -> SavedStream:
+    """Read a state file. fingerprint: of the model that is to go on with it.
+
+    Raises StateFileError naming the file: absent, unreadable, damaged, of another format, or
+    another model's.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise StateFileError(f"cannot read {path}: {error.strerror or error}") from error
+    try:
+        metadata = _metadata(data)
+        tensors = load_tensors(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise StateFileError(f"{path} is damaged, or no state file: {error}") from error
+    if metadata.get("format") != FORMAT:
+        raise StateFileError(
+            f"{path} has format {metadata.get('format')!r}, expected a stream state {FORMAT!r}"
+        )
+    content = metadata.get("content", "")
+    if metadata.get("digest") != _digest(content, tensors):
+        raise StateFileError(f"{path} is damaged: its content does not fit its digest")
+    try:
+        described = json.loads(content)
+        model, state = described["model"], from_plain(described["state"], tensors, _KINDS)
+    except (json.JSONDecodeError, KeyError, TypeError, PlainError) as error:
+        raise StateFileError(f"{path}: the description of the state is bad: {error}") from error
+    if model != fingerprint:
+        raise StateFileError(
+            f"{path} is the state of another model ({model[:12]}), this one is {fingerprint[:12]}"
+        )
+    if not isinstance(state, SavedStream):
+        raise StateFileError(f"{path} holds a {type(state).__name__}, expected a SavedStream")
+    return state
+
+
+def restore(stream: DepthStream, saved: SavedStream) -> None:
+    """Go on where the saved stream was. Raises StateFileError naming an option that differs;
+    the stream is then as it was."""
+    own = stream_options(stream)
+    for name, value in own.items():
+        if saved.options.get(name) != value:
+            raise StateFileError(
+                f"the state was saved with {name} = {saved.options.get(name)!r}, "
+                f"this stream has {value!r}"
+            )
+    stream.camera_matrix = saved.camera_matrix
+    state = saved.memory.state
+    state = None if state is None else state.to(stream.model.device)
+    stream.memory = replace(saved.memory, state=state)
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    """The text entries of a safetensors file in memory; its header is JSON after eight bytes."""
+    length = int.from_bytes(data[:8], "little")
+    if len(data) < 8 or length > len(data) - 8:
+        raise ValueError(f"{len(data)} bytes are too few")
+    header = json.loads(data[8 : 8 + length])
+    return dict(header.get("__metadata__", {}))
+
+
+def _digest(content: str, tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(content.encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.hexdigest()
