@@ -1,10 +1,10 @@
 """Alignment of a prediction to a target by scale and shift (paper sections 4 and 5).
 
 The solvers minimise sum_i min(trunc, w_i |scale * x_i + shift - y_i|), the truncated weighted L1
-error, batched over leading dimensions; trunc None is plain L1. Scale alone is solved exactly.
-With a shift, the fit is assumed to pass exactly through one sample (the anchor), as an optimal
-one does per shifted axis: every candidate anchor's best scale is found exactly, the best anchor
-wins. Nothing here is differentiated through.
+error, batched over leading dimensions; trunc None is plain L1. The objective is the smallest of
+convex, piecewise linear ones (which samples are truncated), so that it has a minimum where kinks
+cross: for a scale and one shift a fit that passes through a sample, which is what is searched.
+Nothing here is differentiated through.
 """
 
 from __future__ import annotations
@@ -15,21 +15,24 @@ from torch import Tensor
 from dyfn_core.geometry.l1_fit import fit_scale_shift
 
 __all__ = [
-    "align_points_scale",
-    "align_points_scale_xyz_shift",
-    "align_points_scale_z_shift",
+    "align_points",
+    "align_points_exact",
     "align_points_shift",
     "align_scale",
     "align_scale_shift",
     "fit_scale_shift",
+    "truncated_error",
 ]
+
+SHIFTS = ("none", "z", "xyz")
+_CHUNK = 1 << 22  # terms of the objective that are worked on at a time
 
 
 @torch.no_grad()
 def align_scale(
     x: Tensor, y: Tensor, weight: Tensor, trunc: float | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The scale that minimises sum min(trunc, weight |scale x - y|) over the last dimension.
+    """The scale that minimises sum min(trunc, weight |scale x - y|) over the last dimension; exact.
 
     x, y, weight: ... x N, weight >= 0. Returns the scale and the error there, both of shape (...).
     Where no sample counts (weight or x zero everywhere) the scale is 0.
@@ -39,7 +42,8 @@ def align_scale(
     centre = torch.where(counts, y / torch.where(counts, x, 1.0), 0.0)
     slope = torch.where(counts, slope, 0.0)
     if trunc is None:
-        return _weighted_median(centre, slope), _error_at_median(x, y, weight, centre, slope)
+        scale = _weighted_median(centre, slope)
+        return scale, (weight * (scale[..., None] * x - y).abs()).sum(-1)
     reach = torch.where(counts, trunc / torch.where(counts, slope, 1.0), 0.0)
     # Each term is flat, falls to the centre, rises, is flat again: sort where slopes change.
     place = torch.cat([centre - reach, centre, centre + reach], dim=-1)
@@ -65,12 +69,6 @@ def _weighted_median(values: Tensor, weight: Tensor) -> Tensor:
     return values.gather(-1, index)[..., 0]
 
 
-def _error_at_median(x: Tensor, y: Tensor, weight: Tensor, centre: Tensor, slope: Tensor) -> Tensor:
-    scale = _weighted_median(centre, slope)
-    return (weight * (scale[..., None] * x - y).abs()).sum(-1)
-
-
-@torch.no_grad()
 def align_scale_shift(
     x: Tensor,
     y: Tensor,
@@ -78,47 +76,93 @@ def align_scale_shift(
     trunc: float | None = None,
     anchors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Scale and shift of values, e.g. depths.
+    """Scale and shift (each B) of values B x N, e.g. depths or disparities.
 
-    x, y, weight: B x N. anchors: B x A indices of the candidate anchors; None tries all of them
-    (exact, and quadratic in N). Returns scale and shift, each B.
+    The affine case of align_points, whose other arguments these are.
     """
-    points_x, points_y = x[..., None], y[..., None]
-    shifted = torch.ones(1, dtype=torch.bool, device=x.device)
-    scale, shift = _align_anchored(points_x, points_y, weight, trunc, anchors, shifted)
+    scale, shift = align_points(x[..., None], y[..., None], weight, "z", trunc, anchors)
     return scale, shift[..., 0]
 
 
-def align_points_scale(
-    points: Tensor, target: Tensor, weight: Tensor, trunc: float | None = None
-) -> Tensor:
-    """The scale of B x N x 3 points against their target, weights B x N. Returns B."""
-    x, y = points.flatten(-2), target.flatten(-2)
-    return align_scale(x, y, weight.repeat_interleave(points.shape[-1], dim=-1), trunc)[0]
-
-
-def align_points_scale_z_shift(
+@torch.no_grad()
+def align_points(
     points: Tensor,
     target: Tensor,
     weight: Tensor,
+    shift: str = "z",
     trunc: float | None = None,
     anchors: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Scale (B) and shift (B x 3, only z differs from 0) of B x N x 3 points, weights B x N."""
-    shifted = torch.tensor([False, False, True], device=points.device)
-    return _align_anchored(points, target, weight, trunc, anchors, shifted)
+    """Scale (B) and shift (B x D) of B x N x D points against their target, weights B x N.
+
+    shift: "none" (all zero), "z" (of the last axis alone) or "xyz" (of every axis).
+    anchors: B x A indices of the samples that the fit may pass through along the shifted axes;
+        None tries all of them, which costs N^2 log N.
+    Without anchors, "none" and "z" are exact. "xyz" is the best of the fits through one sample
+    along all axes at once, as MoGe solves it; align_points_exact knows no such limit.
+    Where nothing has weight, scale and shift are 0. Raises ValueError for another shift.
+    """
+    shifted = _shifted_axes(shift, points)
+    batch, count, dims = points.shape
+    if shift == "none":
+        weights = weight.repeat_interleave(dims, dim=-1)
+        scale, _ = align_scale(points.flatten(-2), target.flatten(-2), weights, trunc)
+        return scale, points.new_zeros(batch, dims)
+    if anchors is None:
+        points, target, weight = _weighted_first(points, target, weight)
+        count = weight.shape[1]
+        anchors = torch.arange(count, device=points.device).expand(batch, -1)
+    index = anchors[..., None].expand(-1, -1, dims)
+    from_points = points.gather(1, index) * shifted
+    from_target = target.gather(1, index) * shifted
+    per_chunk = max(1, _CHUNK // max(1, batch * count * dims))
+    found = [
+        _through(points, target, weight, trunc, start_points, start_target)
+        for start_points, start_target in zip(
+            from_points.split(per_chunk, 1), from_target.split(per_chunk, 1), strict=True
+        )
+    ]
+    scales, errors = (torch.cat(part, 1) for part in zip(*found, strict=True))
+    usable = weight.gather(1, anchors) > 0
+    best = torch.where(usable, errors, torch.inf).argmin(dim=1)
+    rows = torch.arange(batch, device=points.device)
+    scale = torch.where(usable.any(1), scales[rows, best], 0.0)
+    moved = from_target[rows, best] - scale[:, None] * from_points[rows, best]
+    return scale, torch.where(usable.any(1)[:, None], moved, 0.0)
 
 
-def align_points_scale_xyz_shift(
+def _weighted_first(
+    points: Tensor, target: Tensor, weight: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The samples without those, at the end, that have no weight in any entry of the batch."""
+    counts = weight > 0
+    most = max(1, int(counts.sum(1).max()))
+    order = counts.to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
+    index = order[..., None].expand(-1, -1, points.shape[-1])
+    return points.gather(1, index), target.gather(1, index), weight.gather(1, order)
+
+
+def _shifted_axes(shift: str, points: Tensor) -> Tensor:
+    if shift not in SHIFTS:
+        raise ValueError(f"shift {shift!r} is unknown, expected one of {SHIFTS}")
+    axes = torch.full((points.shape[-1],), shift == "xyz", device=points.device)
+    axes[-1] = shift != "none"
+    return axes
+
+
+def _through(
     points: Tensor,
     target: Tensor,
     weight: Tensor,
-    trunc: float | None = None,
-    anchors: Tensor | None = None,
+    trunc: float | None,
+    from_points: Tensor,
+    from_target: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Scale (B) and shift (B x 3) of B x N x 3 points, weights B x N."""
-    shifted = torch.tensor([True, True, True], device=points.device)
-    return _align_anchored(points, target, weight, trunc, anchors, shifted)
+    """The best scale, and its error, of the fit through each anchor (B x A x D): B x A each."""
+    x = (points[:, None] - from_points[:, :, None]).flatten(-2)
+    y = (target[:, None] - from_target[:, :, None]).flatten(-2)
+    weights = weight.repeat_interleave(points.shape[-1], dim=-1)[:, None].expand_as(x)
+    return align_scale(x, y, weights, trunc)
 
 
 def align_points_shift(
@@ -131,28 +175,73 @@ def align_points_shift(
 
 
 @torch.no_grad()
-def _align_anchored(
+def align_points_exact(
+    points: Tensor, target: Tensor, weight: Tensor, trunc: float | None = None
+) -> tuple[Tensor, Tensor]:
+    """The best scale (B) and xyz-shift (B x D) of all, of B x N x D points, weights B x N.
+
+    Given the scale, every axis has a best shift of its own, and some optimal scale is the slope
+    between two samples along one axis. Without truncation the error is convex in the scale: the
+    D N (N - 1) / 2 slopes are searched by bisection. With it they are all tried, N^3 log N:
+    meant for dozens of samples.
+    """
+    start = align_points(points, target, weight, "xyz", trunc)[0]
+    first, second = torch.triu_indices(points.shape[1], points.shape[1], 1, device=points.device)
+    run = (points[:, first] - points[:, second]).flatten(1)
+    rise = (target[:, first] - target[:, second]).flatten(1)
+    counts = ((weight[:, first] > 0) & (weight[:, second] > 0)).repeat_interleave(
+        points.shape[-1], dim=-1
+    )
+    steep = counts & (run != 0)
+    slopes = torch.where(steep, rise / torch.where(steep, run, 1.0), start[:, None])
+    slopes = torch.cat([start[:, None], slopes], dim=1)
+    if trunc is None:
+        scale = _bisect(points, target, weight, slopes.sort(dim=1).values)
+    else:
+        per_chunk = max(1, _CHUNK // max(1, points.numel()))
+        errors = [
+            _error_of_scale(points, target, weight, trunc, chunk)
+            for chunk in slopes.split(per_chunk, 1)
+        ]
+        scale = slopes.gather(1, torch.cat(errors, 1).argmin(1, keepdim=True))[:, 0]
+    return scale, align_points_shift(scale[:, None, None] * points, target, weight, trunc)
+
+
+def _error_of_scale(
+    points: Tensor, target: Tensor, weight: Tensor, trunc: float | None, scales: Tensor
+) -> Tensor:
+    """scales B x S -> the error with the best shifts, B x S."""
+    apart = target[:, None] - scales[..., None, None] * points[:, None]
+    apart = apart.transpose(-1, -2)
+    weights = weight[:, None, None].expand_as(apart)
+    return align_scale(torch.ones_like(apart), apart, weights, trunc)[1].sum(-1)
+
+
+def _bisect(points: Tensor, target: Tensor, weight: Tensor, slopes: Tensor) -> Tensor:
+    """The best of sorted slopes B x S where the error is convex in them: B."""
+    low = torch.zeros(len(slopes), 1, dtype=torch.long, device=slopes.device)
+    high = torch.full_like(low, slopes.shape[1] - 1)
+    while bool((low < high).any()):
+        middle = (low + high) // 2
+        here = slopes.gather(1, middle)
+        # The next larger slope: equal ones say nothing about the direction.
+        after = torch.searchsorted(slopes, here, right=True).clamp(max=slopes.shape[1] - 1)
+        pair = torch.cat([here, slopes.gather(1, after)], dim=1)
+        error = _error_of_scale(points, target, weight, None, pair)
+        falls = error[:, 1:] < error[:, :1]
+        low, high = torch.where(falls, after, low), torch.where(falls, high, middle)
+    return slopes.gather(1, low)[:, 0]
+
+
+def truncated_error(
     points: Tensor,
     target: Tensor,
     weight: Tensor,
-    trunc: float | None,
-    anchors: Tensor | None,
-    shifted: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """B x N x D points: the best fit through one of the anchors along the shifted axes."""
-    batch, count, dims = points.shape
-    if anchors is None:
-        anchors = torch.arange(count, device=points.device).expand(batch, -1)
-    index = anchors[..., None].expand(-1, -1, dims)
-    from_points = points.gather(1, index) * shifted
-    from_target = target.gather(1, index) * shifted
-    x = (points[:, None] - from_points[:, :, None]).flatten(-2)
-    y = (target[:, None] - from_target[:, :, None]).flatten(-2)
-    weights = weight.repeat_interleave(dims, dim=-1)[:, None].expand_as(x)
-    scales, errors = align_scale(x, y, weights, trunc)
-    usable = weight.gather(1, anchors) > 0
-    best = torch.where(usable, errors, torch.inf).argmin(dim=1)
-    rows = torch.arange(batch, device=points.device)
-    scale = torch.where(usable.any(1), scales[rows, best], 0.0)
-    shift = from_target[rows, best] - scale[:, None] * from_points[rows, best]
-    return scale, torch.where(usable.any(1)[:, None], shift, 0.0)
+    scale: Tensor,
+    shift: Tensor,
+    trunc: float | None = None,
+) -> Tensor:
+    """What the solvers minimise, per batch entry: B x N x D points, scale B, shift B x D -> B."""
+    aligned = scale[:, None, None] * points + shift[:, None]
+    error = weight[..., None] * (aligned - target).abs()
+    return (error if trunc is None else error.clamp(max=trunc)).sum((1, 2))

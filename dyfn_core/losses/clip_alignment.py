@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dyfn_core.geometry.alignment import align_points_scale_z_shift
+from dyfn_core.geometry.alignment import align_points
+from dyfn_core.losses.resample import nearest_valid, pick
 from dyfn_core.losses.target import Target
-from dyfn_core.losses.whole_frame import coarse_samples, pick
+from dyfn_core.losses.whole_frame import align_samples, coarse_samples
 
 FIRST_GRID = (10, 12)
 ALL_GRID = (6, 8)
@@ -52,8 +53,7 @@ def align_clips(
     not that of the error: changing the first frame moves all others. Raises ValueError on
     another mode.
     """
-    if mode not in ("first", "all"):
-        raise ValueError(f"alignment mode must be 'first' or 'all', got {mode!r}")
+    check_mode(mode)
     frames = 1 if mode == "first" else target.length
     index = coarse_samples(target.frames, FIRST_GRID if mode == "first" else ALL_GRID)[:1]
 
@@ -63,13 +63,40 @@ def align_clips(
 
     weight = sample(target.weight)
     anchors = torch.multinomial(weight + 1e-9, ANCHORS)
-    scale, shift = align_points_scale_z_shift(
-        sample(points.detach()), sample(target.points), weight, TRUNC, anchors
+    scale, shift = align_points(
+        sample(points.detach()), sample(target.points), weight, "z", TRUNC, anchors
     )
     if differentiable:
         scale, shift = _least_squares(sample(points), sample(target.points), weight, scale, shift)
     usable = scale > 0
     return torch.where(usable, scale, 0.0), torch.where(usable[:, None], shift, 0.0)
+
+
+def align_clips_fully(
+    points: Tensor, target: ClipTarget, mode: str, resolution: int = 32, trunc: float = 1.0
+) -> tuple[Tensor, Tensor]:
+    """As align_clips, by MoGe's sampling and all its anchors; detached, in float64.
+
+    The clips' frames are sampled on a resolution x resolution grid each: with mode "all" the cost
+    grows with the square of their number, and the released code takes a resolution of 8 there.
+    """
+    check_mode(mode)
+    frames = 1 if mode == "first" else target.length
+    valid = target.valid[:, :frames]
+    index, seen = nearest_valid(valid.flatten(0, 1), (resolution, resolution))
+
+    def sample(values: Tensor) -> Tensor:
+        chosen = pick(values[:, :frames].flatten(0, 1), index)
+        return chosen.unflatten(0, (-1, frames)).flatten(1, 2)
+
+    seen = seen.unflatten(0, (-1, frames)).flatten(1)
+    return align_samples(sample(points.detach()), sample(target.points), seen, trunc, points.dtype)
+
+
+def check_mode(mode: str) -> None:
+    """Raises ValueError that names the modes for another one."""
+    if mode not in ("first", "all"):
+        raise ValueError(f"alignment mode must be 'first' or 'all', got {mode!r}")
 
 
 def _least_squares(

@@ -15,3 +15,9 @@ def mask_loss(mask: Tensor, target: Target) -> Tensor:
     counted = target.valid | target.infinite
     error = (mask - target.valid.float()).square()
     return (error * counted).sum() / counted.sum().clamp(min=1)
+
+
+def mask_pixel_loss(mask: Tensor, target: Target) -> Tensor:
+    """The same error as MoGe averages it: B, over all pixels, uncounted ones being 0."""
+    counted = target.valid | target.infinite
+    return ((mask - target.valid.float()).square() * counted).mean((-2, -1))

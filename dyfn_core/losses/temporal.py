@@ -40,3 +40,30 @@ def window_pairs(frames: Sequence[int], windows: Sequence[int]) -> list[tuple[in
         for window in windows
         if frame + window in place
     ]
+
+
+def released_temporal_loss(
+    points: Tensor,
+    target: ClipTarget,
+    scale: Tensor,
+    windows: Sequence[int] = (1, 2, 4, 8),
+) -> Tensor:
+    """The released code's form: sum over windows of the error of the motion vectors.
+
+    |s (p_j - p_{j+k}) - (p*_j - p*_{j+k})| over the mean depth of the pair, averaged over all
+    coordinates and pixels, those not valid in both frames being 0. points: B x T x H x W x 3;
+    scale: B, clips of scale 0 count 0. Windows that do not fit into the clip count 0 (the
+    released code is NaN then).
+    """
+    loss = points.new_zeros(())
+    true = target.points
+    for window in windows:
+        if window >= points.shape[1]:
+            continue
+        moved = scale[:, None, None, None, None] * (points[:, :-window] - points[:, window:])
+        error = (moved - (true[:, :-window] - true[:, window:])).abs()
+        both = target.valid[:, :-window] & target.valid[:, window:]
+        both = both & (scale > 0)[:, None, None, None]
+        depth = 0.5 * (true[:, :-window, ..., 2] + true[:, window:, ..., 2])
+        loss = loss + (error * (both / depth)[..., None]).mean()
+    return loss

@@ -13,9 +13,7 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import (
-    align_points_scale,
-    align_points_scale_xyz_shift,
-    align_points_scale_z_shift,
+    align_points,
     align_points_shift,
     align_scale,
     align_scale_shift,
@@ -129,7 +127,7 @@ def test_frame_without_any_weight_gets_scale_and_shift_zero() -> None:
     points = torch.rand(2, 6, 3)
     weight = torch.ones(2, 6)
     weight[1] = 0
-    scale, shift = align_points_scale_z_shift(points, 2 * points, weight, 1.0)
+    scale, shift = align_points(points, 2 * points, weight, "z", 1.0)
     torch.testing.assert_close(scale, torch.tensor([2.0, 0.0]))
     assert not shift[1].any()
 
@@ -148,7 +146,7 @@ def golden_case(shared_dir: Path, name: str) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("trunc", TRUNCS)
-@pytest.mark.parametrize("rep", [0, 1])
+@pytest.mark.parametrize("rep", [0, 1, 2])
 def test_solvers_match_the_golden_ones(shared_dir: Path, rep: int, trunc: float | None) -> None:
     def case(name: str) -> tuple[tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]:
         found = golden_case(shared_dir, f"{name}/rep{rep}_trunc{trunc}")
@@ -165,14 +163,17 @@ def test_solvers_match_the_golden_ones(shared_dir: Path, rep: int, trunc: float 
     torch.testing.assert_close(scale, found["out/scale"], **near)
     torch.testing.assert_close(shift, found["out/shift"], **near)
     inputs, found = case("align_points_scale")
-    torch.testing.assert_close(align_points_scale(*inputs, trunc), found["out/scale"], **near)
-    for name, solver in (
-        ("align_points_scale_z_shift", align_points_scale_z_shift),
-        ("align_points_scale_xyz_shift", align_points_scale_xyz_shift),
-    ):
-        inputs, found = case(name)
-        scale, shift = solver(*inputs, trunc)
+    scale, _ = align_points(*inputs, "none", trunc)
+    torch.testing.assert_close(scale, found["out/scale"], **near)
+    inputs, found = case("align_depth_scale")
+    torch.testing.assert_close(align_scale(*inputs, trunc)[0], found["out/scale"], **near)
+    for axes in ("z", "xyz"):
+        inputs, found = case(f"align_points_scale_{axes}_shift")
+        scale, shift = align_points(*inputs, axes, trunc)
         torch.testing.assert_close(scale, found["out/scale"], **near)
         torch.testing.assert_close(shift, found["out/shift"], **near)
     inputs, found = case("align_points_xyz_shift")
     torch.testing.assert_close(align_points_shift(*inputs, trunc), found["out/shift"], **near)
+    (points, target, weight), found = case("align_points_z_shift")
+    shift = align_points_shift(points[..., 2:], target[..., 2:], weight, trunc)
+    torch.testing.assert_close(shift, found["out/shift"][..., 2:], **near)
