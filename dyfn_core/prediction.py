@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+DEPTH, DISPARITY = "depth", "disparity"
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -97,6 +99,10 @@ class Prediction:
     mask: H x W bool, True where the prediction is valid.
     intrinsics: 3 x 3 float32, normalised: pixel x = (u + 0.5) / W, y = (v + 0.5) / H.
     state: goes into the next call of the same stream; None for a model without stabilizer.
+    quantity: what the model predicts. "depth": depth is right up to one scale. "disparity": the
+        model's output is `disparity`, right up to scale and shift; depth is its inverse under the
+        assumption that the shift is 0, so compare with truth by aligning `disparity` with 1 / z.
+    disparity: H x W float32, >= 0, only for quantity "disparity".
     """
 
     points: Tensor
@@ -104,3 +110,5 @@ class Prediction:
     mask: Tensor
     intrinsics: Tensor
     state: StreamState | None = None
+    quantity: str = DEPTH
+    disparity: Tensor | None = None

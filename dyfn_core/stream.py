@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dyfn_core.geometry.camera import (
     check_camera_matrix,
+    focal_from_fov,
     intrinsics_from_focal,
     normalize_intrinsics,
     sample,
@@ -21,11 +22,15 @@ from dyfn_core.geometry.camera import (
     solve_focal_shift,
 )
 from dyfn_core.models.base import (
+    NOMINAL_FOV,
+    AffineDisparity,
     AffinePoints,
     GeometryModel,
     assemble,
     first_of_batch,
+    from_disparity,
     image_to_batch,
+    median_disparity,
 )
 from dyfn_core.prediction import Prediction, StreamState
 
@@ -78,7 +83,8 @@ class StreamMemory:
 
     frames: since the last reset. image_size: (H, W). stamp: of the last frame, seconds.
     state: DyFN's. focal: of log(focal / half the diagonal), for an unknown camera.
-    shift: of the z-shift, in the unit of the point map.
+    shift: of the z-shift, in the unit of the point map. unit: for a disparity model, the median
+    disparity of the stream's first frame, which is depth 1 for all that follow.
     """
 
     frames: int = 0
@@ -87,6 +93,7 @@ class StreamMemory:
     state: StreamState | None = None
     focal: Track | None = None
     shift: Track | None = None
+    unit: float | None = None
 
 
 class DepthStream:
@@ -98,6 +105,10 @@ class DepthStream:
     A known camera matrix fixes the focal and the principal point. An unknown camera's focal is a
     robust running mean. The shift is one number per stream as far as DyFN keeps the latent's
     statistics in place, so it is averaged over time; without DyFN every frame has its own.
+
+    A model of disparity knows neither camera nor offset: depth is the inverse of its disparity in
+    units of the first frame's median, an unknown camera is taken for one of NOMINAL_FOV, and
+    every prediction says quantity "disparity".
 
     resets: how often the stream started anew, by reason.
     """
@@ -193,12 +204,17 @@ class DepthStream:
         self._camera_size = size
 
     def finish(
-        self, affine: AffinePoints, state: StreamState | None, stamp: float | None = None
+        self,
+        affine: AffinePoints | AffineDisparity,
+        state: StreamState | None,
+        stamp: float | None = None,
     ) -> Prediction:
-        """The half of push after the network: a frame's affine points (batch of one), its state.
+        """The half of push after the network: a frame's affine output (batch of one), its state.
 
         For callers that run the network themselves, on batches or for several streams at once.
         """
+        if isinstance(affine, AffineDisparity):
+            return self._finish_disparity(affine.disparity, state, stamp)
         valid = affine.mask > self.model.mask_threshold
         size = (valid.shape[-2], valid.shape[-1])
         self._make_room(size)
@@ -230,6 +246,32 @@ class DepthStream:
             self.force_projection,
         )
         self.memory = memory
+        return first_of_batch(prediction)
+
+    def _finish_disparity(
+        self, disparity: Tensor, state: StreamState | None, stamp: float | None
+    ) -> Prediction:
+        size = (disparity.shape[-2], disparity.shape[-1])
+        self._make_room(size)
+        unit = self.memory.unit
+        if unit is None:
+            unit = float(median_disparity(disparity))
+        if self._camera_matrix is not None:
+            intrinsics = torch.from_numpy(normalize_intrinsics(self._camera_matrix, size))[None]
+        else:
+            focal = focal_from_fov(NOMINAL_FOV, size[1] / size[0], 1)
+            intrinsics = intrinsics_from_focal(focal, size[1] / size[0])
+        prediction = from_disparity(
+            disparity, disparity.new_tensor([unit]), intrinsics.to(disparity), state
+        )
+        self.memory = replace(
+            self.memory,
+            frames=self.memory.frames + 1,
+            image_size=size,
+            stamp=stamp,
+            state=state,
+            unit=unit,
+        )
         return first_of_batch(prediction)
 
     def _track_focal(self, memory: StreamMemory, xyz: np.ndarray, uv: np.ndarray) -> StreamMemory:
@@ -305,8 +347,5 @@ def push_together(
         states: Sequence[StreamState | None]
         states = [None] * len(streams) if state is None else state.unbind()
         return [
-            stream.finish(
-                AffinePoints(affine.points[i : i + 1], affine.mask[i : i + 1]), states[i], stamps[i]
-            )
-            for i, stream in enumerate(streams)
+            stream.finish(affine.entry(i), states[i], stamps[i]) for i, stream in enumerate(streams)
         ]

@@ -88,6 +88,8 @@ class Geometry:
     camera_matrix: 3 x 3 float64, pixels: the given one, else the model's estimate.
     reset: why the stream started anew with this frame; None when it went on (or was the first).
     metric: whether points and depth are in metres; else they are right up to one scale.
+    disparity: H x W float32, what a disparity model said: right up to scale and shift, and depth
+        is its inverse only as far as that shift is 0. None for other models.
     """
 
     points: np.ndarray
@@ -96,6 +98,7 @@ class Geometry:
     camera_matrix: np.ndarray
     reset: str | None = None
     metric: bool = False
+    disparity: np.ndarray | None = None
 
     def scaled(self, scale: float) -> Geometry:
         """The same in metres: points and depth times the metres of one unit."""
@@ -242,7 +245,9 @@ def _geometry(prediction: Prediction, frame: StreamFrame, reset: str | None) -> 
     matrix = frame.camera_matrix
     if matrix is None:
         matrix = pixel_matrix(prediction.intrinsics.cpu().numpy(), *depth.shape)
-    return Geometry(prediction.points.cpu().numpy(), depth, valid, matrix, reset)
+    disparity = None if prediction.disparity is None else prediction.disparity.cpu().numpy()
+    points = prediction.points.cpu().numpy()
+    return Geometry(points, depth, valid, matrix, reset, disparity=disparity)
 
 
 def pixel_matrix(intrinsics: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -257,7 +257,8 @@ class StreamDepthNode(LifecycleNode):
         device = settings.device
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
-        make = stream_maker(self._load(settings.model, device))
+        model = self._load(settings.model, device)
+        make = stream_maker(model)
         for camera in self._cameras:
             camera.open_stream(make)
         self._device = device
@@ -265,6 +266,12 @@ class StreamDepthNode(LifecycleNode):
             self.get_logger().info(
                 f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
             )
+            if model.quantity == "disparity":
+                self.get_logger().warning(
+                    f"{settings.model} predicts disparity, right up to scale and shift: the depth "
+                    "published is its inverse over the first frame's median, so shapes are bent "
+                    "as far as that shift is not 0; no metric scale makes it metres"
+                )
 
     # The end.
 

@@ -16,6 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.pictures import encode_picture
@@ -142,7 +143,7 @@ def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFr
 def _run(options: Options, recording: Recording, model: GeometryModel) -> SequenceEvaluation:
     camera = CameraStream(stream_maker(model))
     frames, expected = _frames(options, recording)
-    evaluation = SequenceEvaluation(expected, options.depth_max)
+    evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
     with ExitStack() as stack:
         writer = None
         if options.output_recording:
@@ -155,6 +156,7 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
                 StreamFrame(
                     frame.image,
                     frame.camera_matrix,
+                    visible=frame.visible,
                     stamp=stamp,
                     frame_id=frame.frame_id,
                     stabilize=options.stabilizer,
@@ -163,10 +165,14 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
             )
             latency = time.perf_counter() - start
             try:
+                # Disparity is aligned as such, also where its inverse is too far to be depth.
+                said, valid = geometry.depth, geometry.valid
+                if geometry.disparity is not None:
+                    said, valid = geometry.disparity, np.isfinite(geometry.disparity)
                 evaluation.push(
                     frame.image,
-                    geometry.depth,
-                    geometry.valid,
+                    said,
+                    valid,
                     frame.depth,
                     stamp=stamp,
                     latency=latency,
@@ -186,6 +192,7 @@ def _write_results(
         "frames": results.pop("frames"),
         "model": options.model,
         "stabilizer": options.stabilizer and model.stabilizer is not None,
+        "quantity": model.quantity,
         **results,
         "recording": {
             "path": str(options.recording),

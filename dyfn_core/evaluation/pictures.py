@@ -11,6 +11,9 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from dyfn_core.evaluation.protocols import align_depth
+from dyfn_core.prediction import DEPTH
+
 INVALID = (70, 70, 70)
 MAX_ERROR = 0.5  # relative error that the error map saturates at
 CAPTION_HEIGHT = 22
@@ -65,9 +68,15 @@ class Snapshot:
 
 
 class FrameStrip:
-    """Keeps a few evenly spaced frames of a sequence and draws them side by side."""
+    """Keeps a few evenly spaced frames of a sequence and draws them side by side.
 
-    def __init__(self, expected_frames: int, count: int = 6, width: int = 240) -> None:
+    quantity: what is added as depth; disparity is drawn as the inverse of the aligned one.
+    """
+
+    def __init__(
+        self, expected_frames: int, count: int = 6, width: int = 240, quantity: str = DEPTH
+    ) -> None:
+        self.quantity = quantity
         last = max(expected_frames - 1, 0)
         self.wanted = {round(i) for i in np.linspace(0, last, min(count, last + 1))}
         self.width = width
@@ -98,7 +107,7 @@ class FrameStrip:
         if not self.snapshots:
             raise ValueError("no frame was kept for the strip")
         truths = [s.truth for s in self.snapshots if s.truth is not None]
-        aligned = [scale * s.depth + shift for s in self.snapshots]
+        aligned = [align_depth(s.depth, scale, shift, self.quantity) for s in self.snapshots]
         near, far = depth_range(truths or aligned)
         rows = [
             self._row(s, depth, near, far, bool(truths))

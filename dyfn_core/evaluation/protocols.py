@@ -10,7 +10,9 @@ import numpy as np
 
 from dyfn_core.evaluation.metrics import depth_metrics, mean_metrics
 from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.prediction import DEPTH, DISPARITY
 
+FARTHEST = 1e4  # metres: depth where aligned disparity is not positive, unless capped below
 MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is clipped to it
 MIN_PIXELS = 16  # frames with fewer scored samples are not scored
 
@@ -54,6 +56,8 @@ class SequenceScorer:
     sequence is fitted and scored on fewer, still evenly spread pixels. Deterministic.
 
     depth_max: cap in metres: truth beyond it is invalid, aligned depth is clipped to it.
+    quantity: "disparity" when predictions are affine-invariant disparity: every alignment is then
+    min sum d |s p + t - 1/d|, and the inverse of the aligned disparity is scored as depth.
     Invalid predictions (masked, NaN, infinite, not positive) take no part in fit or score; they
     lower `coverage` instead of counting as depth 0.
     """
@@ -63,7 +67,13 @@ class SequenceScorer:
         depth_max: float = math.inf,
         samples_per_frame: int = 20_000,
         max_samples: int = 4_000_000,
+        quantity: str = DEPTH,
     ) -> None:
+        if quantity not in (DEPTH, DISPARITY):
+            raise ValueError(
+                f"quantity {quantity!r} is unknown, expected {DEPTH!r} or {DISPARITY!r}"
+            )
+        self.quantity = quantity
         self.depth_max = depth_max
         self.samples_per_frame = samples_per_frame
         self.max_samples = max_samples
@@ -77,14 +87,14 @@ class SequenceScorer:
     ) -> FrameScore:
         """Score one frame under the image protocol and keep its samples for the others.
 
-        prediction: H x W depth up to scale and shift; target: H x W metres, invalid where it is
-        NaN, infinite, <= MIN_DEPTH or > depth_max. mask: H x W bool, where the prediction is
-        valid. Raises ValueError on differing shapes.
+        prediction: H x W depth (or disparity) up to scale and shift; target: H x W metres,
+        invalid where it is NaN, infinite, <= MIN_DEPTH or > depth_max. mask: H x W bool, where
+        the prediction is valid. Raises ValueError on differing shapes.
         """
         p, d, coverage = self._sample(prediction, target, mask)
         score = FrameScore(coverage, p.size)
         if p.size >= MIN_PIXELS:
-            scale, shift = fit_scale_shift(p, d, 1 / d)
+            scale, shift = self._fit(p, d)
             score = FrameScore(coverage, p.size, scale, shift, self._score(p, d, scale, shift))
         self.frames.append(score)
         self._keep(p, d)
@@ -106,13 +116,18 @@ class SequenceScorer:
             return None
         target = np.concatenate([d for _, d in self._kept])
         prediction = np.concatenate([p for p, _ in self._kept])
-        return self._aligned(*fit_scale_shift(prediction, target, 1 / target.astype(np.float64)))
+        return self._aligned(*self._fit(prediction, target.astype(np.float64)))
 
     def metric(self) -> SequenceScore | None:
-        """No alignment: the prediction is taken as metres."""
-        if not any(p.size >= MIN_PIXELS for p, _ in self._kept):
+        """No alignment: the prediction is taken as metres; disparity has none, hence None."""
+        if self.quantity == DISPARITY or not any(p.size >= MIN_PIXELS for p, _ in self._kept):
             return None
         return self._aligned(1.0, 0.0)
+
+    def _fit(self, prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+        if self.quantity == DISPARITY:
+            return fit_scale_shift(prediction, 1 / target, target)
+        return fit_scale_shift(prediction, target, 1 / target)
 
     def _aligned(self, scale: float, shift: float) -> SequenceScore:
         frames = [
@@ -123,8 +138,8 @@ class SequenceScorer:
     def _score(
         self, prediction: np.ndarray, target: np.ndarray, scale: float, shift: float
     ) -> dict[str, float]:
-        aligned = np.clip(scale * prediction.astype(np.float64) + shift, MIN_DEPTH, self.depth_max)
-        return depth_metrics(aligned, target)
+        aligned = align_depth(prediction, scale, shift, self.quantity)
+        return depth_metrics(np.clip(aligned, MIN_DEPTH, self.depth_max), target)
 
     def _sample(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None
@@ -136,7 +151,7 @@ class SequenceScorer:
         grid = sample_grid(target.shape, self.samples_per_frame)
         p, d = prediction[grid].astype(np.float32), target[grid].astype(np.float32)
         truth = np.isfinite(d) & (d > MIN_DEPTH) & (d <= self.depth_max)
-        valid = truth & np.isfinite(p) & (p > 0)
+        valid = truth & predicted(p, self.quantity)
         if mask is not None:
             valid &= mask[grid]
         coverage = float(valid.sum() / truth.sum()) if truth.any() else 0.0
@@ -149,6 +164,19 @@ class SequenceScorer:
             self._step *= 2
             self._kept = [(p[::2].copy(), d[::2].copy()) for p, d in self._kept]
             self._total = sum(p.size for p, _ in self._kept)
+
+
+def predicted(prediction: np.ndarray, quantity: str = DEPTH) -> np.ndarray:
+    """Where a prediction says something: finite and positive; disparity may be 0, far away."""
+    return np.isfinite(prediction) & (prediction >= 0 if quantity == DISPARITY else prediction > 0)
+
+
+def align_depth(
+    prediction: np.ndarray, scale: float, shift: float, quantity: str = DEPTH
+) -> np.ndarray:
+    """The aligned prediction as depth, float64; aligned disparity <= 0 is FARTHEST away."""
+    aligned = scale * prediction.astype(np.float64) + shift
+    return 1 / np.maximum(aligned, 1 / FARTHEST) if quantity == DISPARITY else aligned
 
 
 def sample_grid(shape: tuple[int, ...], samples: int) -> tuple[slice, slice]:
@@ -196,15 +224,20 @@ class ControlledScorer:
     Print the floors with every result: a low error of an easy scene proves nothing.
     """
 
-    def __init__(self, depth_max: float = math.inf, control_samples: int = 4_000) -> None:
-        self.scorer = SequenceScorer(depth_max)
+    def __init__(
+        self,
+        depth_max: float = math.inf,
+        control_samples: int = 4_000,
+        quantity: str = DEPTH,
+    ) -> None:
+        self.scorer = SequenceScorer(depth_max, quantity=quantity)
         self.controls = {name: SequenceScorer(depth_max, control_samples) for name in CONTROLS}
 
     def push(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
     ) -> FrameScore:
         """As SequenceScorer.push."""
-        valid = np.isfinite(prediction) & (prediction > 0)
+        valid = predicted(prediction, self.scorer.quantity)
         if mask is not None:
             valid &= mask
         for name, scorer in self.controls.items():

@@ -18,6 +18,7 @@ from dyfn_core.evaluation.protocols import (
     to_shape,
 )
 from dyfn_core.evaluation.report import Cell, Table
+from dyfn_core.prediction import DEPTH
 
 COLUMNS = (
     "frame",
@@ -38,12 +39,15 @@ class SequenceEvaluation:
     """Takes frames one at a time and says at the end how good they were.
 
     expected_frames: how many there will be, for the choice of the strip's frames.
-    depth_max: cap of the ground truth in metres.
+    depth_max: cap of the ground truth in metres. quantity: what is pushed as depth; affine-
+    invariant disparity is aligned as such (protocols.SequenceScorer).
     """
 
-    def __init__(self, expected_frames: int, depth_max: float = float("inf")) -> None:
-        self.scores = ControlledScorer(depth_max)
-        self.strip = FrameStrip(expected_frames)
+    def __init__(
+        self, expected_frames: int, depth_max: float = float("inf"), quantity: str = DEPTH
+    ) -> None:
+        self.scores = ControlledScorer(depth_max, quantity=quantity)
+        self.strip = FrameStrip(expected_frames, quantity=quantity)
         self._stamps: list[float] = []
         self._latencies: list[float] = []
         self._hash = hashlib.sha256()
@@ -61,7 +65,7 @@ class SequenceEvaluation:
     ) -> FrameScore:
         """One frame.
 
-        image: H x W x 3 uint8 RGB. depth: H x W up to scale; valid: H x W bool.
+        image: H x W x 3 uint8 RGB. depth: H x W up to scale (or disparity); valid: H x W bool.
         truth: metres, NaN invalid, of the same field of view (any size); None when unknown.
         stamp, latency: seconds. Raises ValueError when truth has another aspect ratio.
         """

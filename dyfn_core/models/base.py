@@ -17,7 +17,10 @@ from dyfn_core.geometry.camera import (
     recover_focal_shift,
 )
 from dyfn_core.models.stabilizer import Stabilizer
-from dyfn_core.prediction import Prediction, StreamState
+from dyfn_core.prediction import DEPTH, DISPARITY, Prediction, StreamState
+
+NOMINAL_FOV = 60.0  # degrees, of an unknown camera whose model gives no point map
+FARTHEST = 1000.0  # times the unit; disparities closer to 0 say nothing but "far"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,24 @@ class AffinePoints:
     points: Tensor
     mask: Tensor
 
+    def entry(self, index: int) -> AffinePoints:
+        """One image of the batch, as a batch of one."""
+        return AffinePoints(self.points[index : index + 1], self.mask[index : index + 1])
+
+
+@dataclass(frozen=True)
+class AffineDisparity:
+    """What a disparity model says: a / z + b with a > 0 and b unknown, and no camera.
+
+    disparity: B x H x W, >= 0; 0 is what the model takes for infinitely far.
+    """
+
+    disparity: Tensor
+
+    def entry(self, index: int) -> AffineDisparity:
+        """One image of the batch, as a batch of one."""
+        return AffineDisparity(self.disparity[index : index + 1])
+
 
 class GeometryModel(nn.Module, ABC):
     """An encoder and a decoder around one latent, with DyFN in between.
@@ -52,9 +73,13 @@ class GeometryModel(nn.Module, ABC):
     stabilizer: the DyFN module, or None for a plain base model. Its parameters are
         "stabilizer.*" in the state dict of every model.
     mask_threshold: a pixel is valid where the raw mask exceeds it.
+    quantity: "depth" (decode gives AffinePoints) or "disparity" (AffineDisparity).
+    stabilizer_pool: the pooling that suits a new stabilizer on this latent.
     """
 
     mask_threshold: float = 0.5
+    quantity: str = DEPTH
+    stabilizer_pool: int = 1
     # No class-level None here: it would hide the registered submodule.
     stabilizer: Stabilizer | None
 
@@ -86,8 +111,8 @@ class GeometryModel(nn.Module, ABC):
         """image: B x 3 x H x W float RGB in 0..1 -> Latent."""
 
     @abstractmethod
-    def decode(self, latent: Latent) -> AffinePoints:
-        """Latent -> affine-invariant points at latent.image_size."""
+    def decode(self, latent: Latent) -> AffinePoints | AffineDisparity:
+        """Latent -> affine-invariant points (or disparity) at latent.image_size."""
 
     def stabilize(
         self, features: Tensor, state: StreamState | None
@@ -115,8 +140,8 @@ class GeometryModel(nn.Module, ABC):
         state: StreamState | None = None,
         num_tokens: int | None = None,
         stabilize: bool = True,
-    ) -> tuple[AffinePoints, StreamState | None]:
-        """image B x 3 x H x W float RGB in 0..1 -> affine-invariant points, next state.
+    ) -> tuple[AffinePoints | AffineDisparity, StreamState | None]:
+        """image B x 3 x H x W float RGB in 0..1 -> affine-invariant points or disparity, state.
 
         With stabilize=False nothing of the stabilizer runs and the state comes back as None.
         """
@@ -144,7 +169,8 @@ class GeometryModel(nn.Module, ABC):
         state: the previous prediction's state of the same stream(s); None at the first frame.
         num_tokens: how finely to look; None for the model's default.
         fov_x: horizontal field of view in degrees when the camera is known (one number or B);
-            None recovers it from the point map.
+            None recovers it from the point map, or takes NOMINAL_FOV where there is none
+            (quantity "disparity").
         force_projection: points are the depth unprojected with the intrinsics; else the
             model's own points plus the shift.
         apply_mask: depth and points are +inf where the prediction is invalid.
@@ -153,6 +179,14 @@ class GeometryModel(nn.Module, ABC):
         """
         batch, single = image_to_batch(image, self.device)
         affine, state = self.predict_affine(batch, state, num_tokens, stabilize)
+        if isinstance(affine, AffineDisparity):
+            height, width = affine.disparity.shape[-2:]
+            angle = NOMINAL_FOV if fov_x is None else fov_x
+            focal = focal_from_fov(angle, width / height, len(batch))
+            intrinsics = intrinsics_from_focal(focal, width / height).to(affine.disparity)
+            unit = median_disparity(affine.disparity)
+            prediction = from_disparity(affine.disparity, unit, intrinsics, state, apply_mask)
+            return first_of_batch(prediction) if single else prediction
         valid = affine.mask > self.mask_threshold
         height, width = valid.shape[-2:]
         focal = None if fov_x is None else focal_from_fov(fov_x, width / height, len(valid))
@@ -190,14 +224,43 @@ def assemble(
     return Prediction(points, depth, valid, intrinsics, state)
 
 
+def from_disparity(
+    disparity: Tensor,
+    unit: Tensor,
+    intrinsics: Tensor,
+    state: StreamState | None,
+    apply_mask: bool = True,
+) -> Prediction:
+    """Disparity B x H x W -> Prediction with depth = unit / disparity, batched.
+
+    This takes the unknown offset b of a / z + b for 0. unit: B, the disparity that becomes depth
+    1. Pixels FARTHEST times as far, or at disparity 0, are no valid pixels. intrinsics: B x 3 x 3.
+    """
+    unit = unit[:, None, None]
+    valid = (disparity > unit / FARTHEST) & torch.isfinite(disparity)
+    depth = torch.where(valid, unit / torch.where(valid, disparity, 1.0), FARTHEST)
+    points = depth_to_points(depth, intrinsics)
+    if apply_mask:
+        depth = torch.where(valid, depth, torch.inf)
+        points = torch.where(valid[..., None], points, torch.inf)
+    return Prediction(points, depth, valid, intrinsics, state, DISPARITY, disparity)
+
+
+def median_disparity(disparity: Tensor) -> Tensor:
+    """B x H x W -> B: the median of each image's positive disparities, 1 where there is none."""
+    positive = torch.where(disparity > 0, disparity, torch.nan).flatten(1)
+    return positive.nanmedian(dim=1).values.nan_to_num(nan=1.0)
+
+
 def first_of_batch(prediction: Prediction) -> Prediction:
     """A batch of one -> the prediction of that image (the state keeps its leading 1)."""
-    return Prediction(
-        prediction.points[0],
-        prediction.depth[0],
-        prediction.mask[0],
-        prediction.intrinsics[0],
-        prediction.state,
+    return replace(
+        prediction,
+        points=prediction.points[0],
+        depth=prediction.depth[0],
+        mask=prediction.mask[0],
+        intrinsics=prediction.intrinsics[0],
+        disparity=None if prediction.disparity is None else prediction.disparity[0],
     )
 
 

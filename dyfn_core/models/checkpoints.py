@@ -1,18 +1,20 @@
 """Every known checkpoint format in, one format out; models by name, path or Hub id.
 
-In: the official MoGe v1 and DyFN files ({"model_config", "model"} pickles, loaded with
-weights_only=True) and ours. Out: ours, one .safetensors whose metadata holds the config as JSON.
+In: the official MoGe v1 and DyFN files ({"model_config", "model"} pickles), those of Depth
+Anything V2 (a bare state dict), all loaded with weights_only=True, and ours. Out: ours, one
+.safetensors whose metadata holds the config as JSON.
 Loading is strict: a key that is missing, left over or of another shape is an error.
 """
 
 from __future__ import annotations
 
+import difflib
 import json
 import logging
 import os
 import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -24,15 +26,25 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.depth_anything import DepthAnythingModel, official_encoder
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
 from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 logger = logging.getLogger(__name__)
 
-MODEL_TYPES: dict[str, type[GeometryModel]] = {"moge": MoGeModel, "mini": MiniModel}
+MODEL_TYPES: dict[str, type[GeometryModel]] = {
+    "depth_anything_v2": DepthAnythingModel,
+    "mini": MiniModel,
+    "moge": MoGeModel,
+}
 BUNDLED = {"dyfn-mini": "dyfn-mini.safetensors"}
-HUB_FILES = {"shawlyu/dyfn": "DyFN.pt"}
+HUB_FILES = {
+    "shawlyu/dyfn": "DyFN.pt",
+    "depth-anything/depth-anything-v2-small": "depth_anything_v2_vits.pth",
+    "depth-anything/depth-anything-v2-base": "depth_anything_v2_vitb.pth",
+    "depth-anything/depth-anything-v2-large": "depth_anything_v2_vitl.pth",
+}
 HUB_DEFAULT = "model.pt"
 OFFICIAL_STABILIZER = "head.stabilizer."
 # Options of released configs that say what MoGe v1 does anyway.
@@ -95,6 +107,7 @@ def empty_model(config: Mapping[str, Any], source: str = "config") -> GeometryMo
     if kind not in MODEL_TYPES:
         raise CheckpointError(
             f"{source}: model type {kind!r} is unknown, expected one of {sorted(MODEL_TYPES)}"
+            + _near(str(kind), MODEL_TYPES)
         )
     try:
         model = MODEL_TYPES[kind].from_config(dict(config))
@@ -122,11 +135,10 @@ def load_weights(
     """
     own = model.state_dict()
     expected = {_official_name(key) if official else key: value for key, value in own.items()}
-    problems = [
-        f"missing: {key} ({_shape(value)})" for key, value in expected.items() if key not in weights
-    ]
+    missing = {key: value for key, value in expected.items() if key not in weights}
+    problems = [f"missing: {key} ({_shape(value)})" for key, value in missing.items()]
     problems += [
-        f"unexpected: {key} ({_shape(value)})"
+        f"unexpected: {key} ({_shape(value)}){_near(key, missing)}"
         for key, value in weights.items()
         if key not in expected
     ]
@@ -219,18 +231,35 @@ def _read_official(path: Path) -> Checkpoint:
             "an official .pt that holds 'model_config' and 'model' and loads with "
             f"weights_only=True): {type(error).__name__}"
         ) from error
+    if isinstance(content, dict) and any(str(key).startswith("pretrained.") for key in content):
+        return _depth_anything(content, path)
     if not isinstance(content, dict) or not {"model_config", "model"} <= set(content):
         found = sorted(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise CheckpointError(
             f"{path} is no official checkpoint: expected 'model_config' and 'model', found {found}"
+            " (nor is it Depth Anything V2, with 'pretrained.*' and 'depth_head.*')"
         )
     config, weights = content["model_config"], content["model"]
     if not isinstance(config, dict) or not isinstance(weights, dict):
         raise CheckpointError(f"{path}: 'model_config' and 'model' must be dictionaries")
+    _only_tensors(weights, path)
+    return Checkpoint(_from_official_config(config, path), weights, {}, official=True)
+
+
+def _only_tensors(weights: dict[str, Any], path: Path) -> None:
     strange = [key for key, value in weights.items() if not isinstance(value, Tensor)]
     if strange:
-        raise CheckpointError(f"{path}: entries of 'model' that are no tensors: {strange}")
-    return Checkpoint(_from_official_config(config, path), weights, {}, official=True)
+        raise CheckpointError(f"{path}: weights that are no tensors: {strange}")
+
+
+def _depth_anything(weights: dict[str, Any], path: Path) -> Checkpoint:
+    """An official file of Depth Anything V2: a bare state dict whose sizes say which one."""
+    _only_tensors(weights, path)
+    try:
+        config = {"type": "depth_anything_v2", "encoder": official_encoder(weights)}
+    except ValueError as error:
+        raise CheckpointError(f"{path}: {error}") from error
+    return Checkpoint(config, weights, {}, official=True)
 
 
 def _from_official_config(config: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -250,6 +279,11 @@ def _from_official_config(config: dict[str, Any], path: Path) -> dict[str, Any]:
     for key in sorted(set(ours) - known):
         logger.warning("%s: ignoring model_config entry %s = %r", path, key, ours.pop(key))
     return ours
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    found = difflib.get_close_matches(name, list(names), n=1, cutoff=0.8)
+    return f", did you mean {found[0]!r}?" if found else ""
 
 
 def _official_name(key: str) -> str:

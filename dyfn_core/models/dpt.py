@@ -1,0 +1,109 @@
+"""The DPT head of Depth Anything V2: four encoder layers in, one disparity map out.
+
+Parameter names are those of the official files ("projects", "resize_layers", "scratch.*").
+"""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+OUTPUT_CHANNELS = 32
+
+
+class ResidualConvUnit(nn.Module):
+    """x + conv(relu(conv(relu(x)))), 3 x 3."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: B x C x h x w."""
+        return self.conv2(F.relu(self.conv1(F.relu(x)))) + x
+
+
+class FusionBlock(nn.Module):
+    """A coarser path and a finer layer joined, refined and projected, at the finer resolution."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.resConfUnit1 = ResidualConvUnit(channels)
+        self.resConfUnit2 = ResidualConvUnit(channels)
+        self.out_conv = nn.Conv2d(channels, channels, 1)
+
+    def forward(self, path: Tensor, layer: Tensor | None) -> Tensor:
+        """path, layer: B x C x h x w; the coarsest block has no layer beside it."""
+        if layer is not None:
+            path = path + self.resConfUnit1(layer)
+        # A 1 x 1 convolution and the resizing that follows commute; this order is four times less.
+        return self.out_conv(self.resConfUnit2(path))
+
+
+class Scratch(nn.Module):
+    """The part of the head after the reassembly, under the name that it has in official files."""
+
+    def __init__(self, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = (
+            nn.Conv2d(width, channels, 3, padding=1, bias=False) for width in widths
+        )
+        self.refinenet1 = FusionBlock(channels)
+        self.refinenet2 = FusionBlock(channels)
+        self.refinenet3 = FusionBlock(channels)
+        # The coarsest block's first unit is in every official file and has no input.
+        self.refinenet4 = FusionBlock(channels)
+        self.output_conv1 = nn.Conv2d(channels, channels // 2, 3, padding=1)
+        self.output_conv2 = nn.Sequential(
+            nn.Conv2d(channels // 2, OUTPUT_CHANNELS, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(OUTPUT_CHANNELS, 1, 1),
+        )
+
+
+class DPTHead(nn.Module):
+    """Encoder layers -> latent (`fuse`); latent -> disparity (`forward`).
+
+    The latent is the last fusion block's output before its resizing, B x channels x 4h x 4w for an
+    h x w grid of tokens: the one map that everything after it is computed from.
+    """
+
+    def __init__(self, encoder_channels: int, widths: tuple[int, ...], channels: int) -> None:
+        super().__init__()
+        self.projects = nn.ModuleList(nn.Conv2d(encoder_channels, width, 1) for width in widths)
+        self.resize_layers = nn.ModuleList(
+            [
+                nn.ConvTranspose2d(widths[0], widths[0], 4, stride=4),
+                nn.ConvTranspose2d(widths[1], widths[1], 2, stride=2),
+                nn.Identity(),
+                nn.Conv2d(widths[3], widths[3], 3, stride=2, padding=1),
+            ]
+        )
+        self.scratch = Scratch(widths, channels)
+
+    def fuse(self, layers: list[Tensor]) -> Tensor:
+        """Four encoder layers, fine to coarse, each B x C x h x w -> the latent."""
+        scratch = self.scratch
+        narrow = (scratch.layer1_rn, scratch.layer2_rn, scratch.layer3_rn, scratch.layer4_rn)
+        one, two, three, four = (
+            reduce(resize(project(layer)))
+            for project, resize, reduce, layer in zip(
+                self.projects, self.resize_layers, narrow, layers, strict=True
+            )
+        )
+        path = resized(scratch.refinenet4(four, None), three.shape[-2:])
+        path = resized(scratch.refinenet3(path, three), two.shape[-2:])
+        path = resized(scratch.refinenet2(path, two), one.shape[-2:])
+        return scratch.refinenet1(path, one)
+
+    def forward(self, latent: Tensor, size: tuple[int, int]) -> Tensor:
+        """latent B x C x 4h x 4w -> disparity B x 1 x H x W >= 0 at the network's size."""
+        height, width = latent.shape[-2:]
+        x = self.scratch.output_conv1(resized(latent, (2 * height, 2 * width)))
+        return F.relu(self.scratch.output_conv2(resized(x, size)))
+
+
+def resized(x: Tensor, size: tuple[int, ...]) -> Tensor:
+    """B x C x h x w -> B x C x size, bilinear between corners that stay corners."""
+    return F.interpolate(x, tuple(size), mode="bilinear", align_corners=True)
