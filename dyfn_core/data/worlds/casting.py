@@ -27,8 +27,11 @@ class Cast:
 
     def __init__(self, files: GameFiles | None, showroom: Showroom | None) -> None:
         self.files, self.showroom = files, showroom
+        self.figures: list[tuple[str, str]] = []
         people = [p for p in md3.players(files) if p.split("/")[-1] in PEOPLE] if files else []
-        self.figures = [(p, skin) for p in people for skin in md3.skins(files, p)]
+        for player in people:
+            assert files is not None
+            self.figures += [(player, skin) for skin in md3.skins(files, player)]
         pieces = showroom.pieces if showroom else []
         self.props = [p for p in pieces if _is_prop(p)]
 

@@ -43,8 +43,8 @@ class Style:
         blurred = rng.random() < 0.4
         return Style(
             gloss=float(rng.uniform(0, 0.8)),
-            contrast=float(rng.uniform(0, 1) * (rng.random() < 0.8)),
-            brightness=float(np.clip(rng.lognormal(np.log(100), 0.25), 50, 165)),
+            contrast=float(rng.uniform(0.2, 1) * (rng.random() < 0.85)),
+            brightness=float(np.clip(rng.lognormal(np.log(106), 0.22), 50, 165)),
             lag=float(rng.choice([0.02, 0.2, 0.5, 0.75])),
             shutter=float(np.clip(rng.lognormal(np.log(0.016), 0.6), 0.004, 0.06)) * blurred,
             corners=float(rng.uniform(0.3, 1.0)),
@@ -79,7 +79,7 @@ class Photographer:
             return None
         mean = max(float(image[solid].mean()), 2.0)
         contrast = image[solid].std() / mean
-        if contrast < 0.08 or (contrast < 0.18 and self.rng.random() < 0.7):
+        if contrast < 0.08 or (contrast < 0.22 and self.rng.random() < 0.8):
             return None
         return float(np.clip((self.style.brightness / mean) ** 2, *GAINS))
 

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyfn_core.data.worlds import textures
+from dyfn_core.data.worlds import clutter, groups, textures
 from dyfn_core.data.worlds.furniture import Piece, Showroom
-from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder
+from dyfn_core.data.worlds.room import Room
+from dyfn_core.data.worlds.scene import Light, Scene
 
 TOPS = re.compile(
     r"table|desk|cabinet|counter|chest|dresser|drawer|console|nightstand|sideboard|bookcase|shel|"
     r"stool|fridge|oven|washer|worktop|buffet",
     re.IGNORECASE,
 )
+CHANCES = {
+    "office": 0.42, "living": 0.18, "kitchen": 0.16, "bedroom": 0.09, "bathroom": 0.05,
+    "storage": 0.1,
+}  # fmt: skip
 KINDS: dict[str, tuple[str, ...]] = {
     "living": ("Living room", "Living room", "Lights", "Miscellaneous"),
     "office": ("Office", "Office", "Living room", "Miscellaneous"),
@@ -26,36 +30,6 @@ KINDS: dict[str, tuple[str, ...]] = {
 }
 
 
-@dataclass
-class Room:
-    """One box of a room while it is being filled. size: (x, y, z) metres from the origin."""
-
-    rng: np.random.Generator
-    size: np.ndarray
-    builder: SceneBuilder = field(default_factory=SceneBuilder)
-    taken: list[tuple[float, float, float, float]] = field(default_factory=list)
-
-    def fits(self, x: float, y: float, half_x: float, half_y: float) -> bool:
-        """Whether a footprint (centre, half sizes) is inside and free."""
-        inside = half_x <= x <= self.size[0] - half_x and half_y <= y <= self.size[1] - half_y
-        return inside and all(
-            abs(x - a) > half_x + c or abs(y - b) > half_y + d for a, b, c, d in self.taken
-        )
-
-    def wall_spot(self, width: float, depth: float) -> tuple[float, float, float]:
-        """A random place with its back to a wall: x, y, yaw (the back is towards +y at yaw 0)."""
-        wall = int(self.rng.integers(4))
-        length = self.size[0] if wall in (0, 2) else self.size[1]
-        along = self.rng.uniform(width / 2, max(length - width / 2, width / 2 + 1e-3))
-        off = depth / 2 + 0.01
-        return [
-            (along, self.size[1] - off, 0.0),
-            (off, along, np.pi / 2),
-            (along, off, np.pi),
-            (self.size[0] - off, along, -np.pi / 2),
-        ][wall]
-
-
 def furnished_room(
     rng: np.random.Generator, showroom: Showroom | None, pool: list[np.ndarray]
 ) -> Scene:
@@ -63,23 +37,50 @@ def furnished_room(
 
     pool: images for posters, boxes and some surfaces; may be empty.
     """
-    large = rng.random() < 0.3
-    size = rng.uniform([2.4, 2.6, 2.3], [8.5, 11.0, 3.6] if large else [5.0, 6.0, 2.9])
-    room = Room(rng, size)
+    large = rng.random() < 0.4
+    size = rng.uniform([2.6, 2.8, 2.35], [8.5, 11.0, 3.6] if large else [5.2, 6.5, 2.9])
+    room = Room(rng, size, showroom, pool)
+    lights = _lights(room)
     _shell(room, pool)
-    if rng.random() < 0.35:
+    if rng.random() < 0.3:
         _partition(room)
+    kind = str(rng.choice(list(CHANCES), p=list(CHANCES.values())))
     if showroom is not None:
-        _furnish(room, showroom, pool)
-    _boxes(room, pool, int(rng.poisson(3 if showroom else 9)))
+        _openings(room, showroom)
+    _groups(room, kind)
+    if showroom is not None:
+        _furnish(room, showroom, kind)
+    _boxes(room, pool, int(rng.poisson(1.5 if showroom else 6)))
     return room.builder.build(
-        lights=_lights(room),
-        ambient=(rng.uniform(0.1, 0.5) * (0.75 + 0.5 * rng.random(3))).astype(np.float32),
+        lights=lights,
+        ambient=(rng.uniform(0.15, 0.6) * (0.88 + 0.24 * rng.random(3))).astype(np.float32),
         viewpoints=np.column_stack(
             [rng.uniform(0.4, size[:2] - 0.4, (40, 2)), np.full(40, size[2] - 0.9)]
         ),
+        interests=np.array(room.interests).reshape(-1, 3),
         name="room",
     )
+
+
+def _groups(room: Room, kind: str) -> None:
+    """Groups of furniture as the kind of room has them, the biggest first."""
+    rng, area = room.rng, float(room.size[0] * room.size[1])
+    many = max(1, int(area / 14))
+    if kind == "office":
+        for _ in range(int(rng.integers(1, many + 2))):
+            groups.desks(room)
+    tables = {"office": 0.5, "living": 0.6, "kitchen": 0.85, "storage": 0.3}.get(kind, 0.15)
+    for _ in range(many):
+        if rng.random() < tables:
+            groups.meeting_table(room)
+    if rng.random() < {"office": 0.3, "living": 0.9}.get(kind, 0.15):
+        groups.sofa_corner(room)
+    for _ in range(int(rng.poisson(1.0 + 0.04 * area))):
+        groups.bookcase(room)
+    for _ in range(int(rng.poisson({"kitchen": 2.0, "office": 1.2}.get(kind, 0.6)))):
+        groups.cupboards(room)
+    for _ in range(int(rng.poisson(0.5 + 0.03 * area))):
+        groups.big_plant(room)
 
 
 def _image(rng: np.random.Generator, pool: list[np.ndarray], share: float) -> np.ndarray:
@@ -90,14 +91,18 @@ def _image(rng: np.random.Generator, pool: list[np.ndarray], share: float) -> np
 
 def _surface(room: Room, pool: list[np.ndarray], kind: str) -> int:
     rng = room.rng
+    chance = rng.random()
     if kind == "wall":
-        image = textures.plaster(rng) if rng.random() < 0.7 else textures.material(rng)
+        painted = textures.plaster(rng) if chance < 0.75 else textures.material(rng)
+        image = textures.paint(rng) if chance < 0.6 else painted
     elif kind == "ceiling":
-        image = textures.plaster(rng) if rng.random() < 0.6 else textures.tiles(rng)
+        image = textures.paint(rng) if chance < 0.75 else textures.tiles(rng)
         image = (255 - (255 - image.astype(np.float32)) * 0.4).astype(np.uint8)
     else:
         image = textures.material(rng)
-    if pool and rng.random() < 0.08:
+        if chance < 0.75:
+            image = textures.carpet(rng) if chance < 0.4 else textures.wood(rng)
+    if pool and rng.random() < 0.04:
         image = pool[rng.integers(len(pool))]
     return room.builder.texture((kind, int(rng.integers(1 << 30))), image)
 
@@ -109,6 +114,11 @@ def _shell(room: Room, pool: list[np.ndarray]) -> None:
     build.quad(
         np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]]), floor, (x / repeat, y / repeat)
     )
+    if rng.random() < 0.3:  # another floor in a part of the room
+        part, other = rng.uniform(0.25, 0.75), _surface(room, pool, "floor")
+        a, b = (part * x, y) if rng.random() < 0.5 else (x, part * y)
+        corners = np.array([[0, 0, 0.002], [a, 0, 0.002], [a, b, 0.002], [0, b, 0.002]])
+        build.quad(corners, other, (a / repeat, b / repeat))
     build.quad(np.array([[0, y, z], [x, y, z], [x, 0, z], [0, 0, z]]), ceiling, (x / 1.2, y / 1.2))
     corners = np.array([[0, 0], [x, 0], [x, y], [0, y]])
     wall = _surface(room, pool, "wall")
@@ -146,6 +156,15 @@ def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> N
             start = length * (i + 0.5) / count - width / 2
             panel(start - 0.06, width + 0.12, low - 0.06, high + 0.06, frame, 0.02, 0)
             panel(start, width, low, high, view, 0.025, glow)
+            _cross(room, a + along * start, along * width, inward, low, high, frame)
+        if rng.random() < 0.4:
+            _curtains(room, a, along, inward, (length, width * count, high + 0.1))
+        return
+    if rng.random() < 0.15 and length > 2.2:
+        board = build.texture(("board", int(rng.integers(1 << 30))), textures.whiteboard(rng))
+        width = rng.uniform(1.2, min(2.4, length - 0.4))
+        panel(rng.uniform(0.1, length - width - 0.1), width, 0.9, rng.uniform(1.8, 2.1), board,
+              0.03, 0)  # fmt: skip
         return
     for _ in range(int(rng.poisson(1.2))):
         width, tall = rng.uniform(0.2, min(1.6, 0.8 * length)), rng.uniform(0.2, 1.1)
@@ -153,6 +172,35 @@ def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> N
         layer = build.texture(("hung", int(rng.integers(1 << 30))), _image(rng, pool, 0.6))
         start, off = rng.uniform(0, length - width), rng.uniform(0.01, 0.05)
         panel(start, width, low, low + tall, layer, off, rng.choice([0, 0, 0, 1.5]))
+
+
+def _cross(
+    room: Room, start: np.ndarray, across: np.ndarray, inward: np.ndarray,
+    low: float, high: float, layer: int,
+) -> None:  # fmt: skip
+    """The bars of a window: one upright in the middle, perhaps one across; and a sill."""
+    yaw = float(np.arctan2(across[1], across[0]))
+    middle, width = start + across / 2 + inward * 0.05, float(np.linalg.norm(across))
+    place = groups.spot(room, float(middle[0]), float(middle[1]), yaw)
+    place.box(0, 0, low, (0.06, 0.05, high - low), layer)
+    if room.rng.random() < 0.5:
+        place.box(0, 0, low + (high - low) * 0.7, (width, 0.05, 0.05), layer)
+    place.box(0, 0, low - 0.07, (width + 0.15, 0.1, 0.03), layer)
+
+
+def _curtains(
+    room: Room, a: np.ndarray, along: np.ndarray, inward: np.ndarray,
+    sizes: tuple[float, float, float],
+) -> None:  # fmt: skip
+    """Two curtains beside the windows of a wall; sizes: wall, windows, upper edge."""
+    length, windows, high = sizes
+    yaw = float(np.arctan2(along[1], along[0])) + np.pi
+    for side in (-1, 1):
+        at = a + along * np.clip(length / 2 + side * (windows / 2 + 0.1), 0.3, length - 0.3)
+        at = at + inward * 0.03
+        low = float(room.rng.choice([0.03, 0.4]))
+        place = groups.spot(room, float(at[0]), float(at[1]), yaw, low)
+        clutter.curtain(place, float(room.rng.uniform(0.3, 0.55)), high - low)
 
 
 def _partition(room: Room) -> None:
@@ -169,30 +217,33 @@ def _partition(room: Room) -> None:
         room.taken.append((*(low + size / 2), *(size / 2)))
 
 
-def _furnish(room: Room, showroom: Showroom, pool: list[np.ndarray]) -> None:
-    rng = room.rng
-    categories = KINDS[str(rng.choice(list(KINDS)))]
-    pieces = [p for c in categories for p in showroom.of(c)]
-    small = [p for p in showroom.pieces if max(p.size) < 0.6 and not p.is_opening]
-    for piece in rng.permutation(np.array(showroom.openings(), dtype=object))[:2]:
+def _openings(room: Room, showroom: Showroom) -> None:
+    """A door or two, and windows, in the walls."""
+    pieces = np.array(showroom.openings(), dtype=object)
+    for piece in room.rng.permutation(pieces)[:3]:
         x, y, yaw = room.wall_spot(piece.size[0], piece.size[1])
         if piece.size[2] + piece.elevation < room.size[2]:
-            _put(room, showroom, piece, np.array([x, y, piece.elevation]), yaw, pool)
+            room.put(piece, np.array([x, y, piece.elevation]), yaw)
             room.taken.append((x, y, 0.5, 0.5))
+
+
+def _furnish(room: Room, showroom: Showroom, kind: str) -> None:
+    """Single pieces of the kind's categories where there still is room."""
+    rng = room.rng
+    pieces = [p for c in KINDS[kind] for p in showroom.of(c)]
+    small = [p for p in showroom.pieces if max(p.size) < 0.6 and not p.is_opening]
     area = float(room.size[0] * room.size[1])
     people = showroom.of("Characters")
-    for _ in range(int(area * rng.uniform(0.6, 2.4)) + 3):
+    for _ in range(int(area * rng.uniform(0.3, 1.6)) + 3):
         piece = pieces[rng.integers(len(pieces))]
         if people and rng.random() < 0.03:
             piece = people[rng.integers(len(people))]
         if max(piece.size[:2]) < 0.25 or piece.size[2] + piece.elevation > room.size[2]:
             continue
-        _stand(room, showroom, piece, small, pool)
+        _stand(room, piece, small)
 
 
-def _stand(
-    room: Room, showroom: Showroom, piece: Piece, small: list[Piece], pool: list[np.ndarray]
-) -> None:
+def _stand(room: Room, piece: Piece, small: list[Piece]) -> None:
     rng, (width, depth, height) = room.rng, piece.size
     if rng.random() < 0.65 or piece.elevation > 0.5:
         x, y, yaw = room.wall_spot(width, depth)
@@ -203,30 +254,18 @@ def _stand(
     half = (c * width + s * depth) / 2 - 1e-3, (s * width + c * depth) / 2 - 1e-3
     if not room.fits(x, y, *half):
         return
-    if not _put(room, showroom, piece, np.array([x, y, piece.elevation]), yaw, pool):
+    if not room.put(piece, np.array([x, y, piece.elevation]), yaw):
         return
     if piece.elevation < 0.5:
         room.taken.append((x, y, *half))
+        room.interests.append(np.array([x, y, min(height * 0.9, 1.3)]))
     if TOPS.search(piece.name) and 0.3 < height < 1.5 and piece.elevation < 0.3:
         for _ in range(int(rng.poisson(2.5))):
             item = small[rng.integers(len(small))]
             local = rng.uniform(-0.4, 0.4, 2) * [width, depth]
             turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
             spot = np.array([*(np.array([x, y]) + turn @ local), height + piece.elevation])
-            _put(room, showroom, item, spot, yaw + rng.normal(0, 0.6), pool)
-
-
-def _put(
-    room: Room, showroom: Showroom, piece: Piece, position: np.ndarray, yaw: float,
-    pool: list[np.ndarray],
-) -> bool:  # fmt: skip
-    rng, images = room.rng, {}
-    for index, part in enumerate(showroom.parts(piece)):
-        if rng.random() < (0.12 if part.image is not None else 0.45):
-            own = pool and rng.random() < 0.15
-            images[index] = pool[rng.integers(len(pool))] if own else textures.material(rng)
-    tint = np.clip(rng.lognormal(0.1, 0.35) * rng.normal(1, 0.08, 3), 0.2, 2.5)
-    return showroom.place(room.builder, piece, position, yaw, tint, images)
+            room.put(item, spot, yaw + rng.normal(0, 0.6))
 
 
 def _boxes(room: Room, pool: list[np.ndarray], count: int) -> None:
@@ -251,6 +290,17 @@ def _boxes(room: Room, pool: list[np.ndarray], count: int) -> None:
             base, half, yaw = high, half * rng.uniform(0.5, 0.95), yaw + rng.normal(0, 0.3)
 
 
+def _lamp(room: Room, below: np.ndarray) -> None:
+    """What a ceiling light looks like: a glowing panel above its position."""
+    rng = room.rng
+    size = (1.2, 0.2) if rng.random() < 0.4 else (0.6, 0.6)
+    glow = room.builder.texture("glow", np.full((4, 4, 3), 250, np.uint8))
+    (x, y), z = below[:2], min(float(below[2]) + 0.04, float(room.size[2]) - 0.01)
+    a, b = np.array(size) / 2
+    corners = [[x - a, y + b, z], [x + a, y + b, z], [x + a, y - b, z], [x - a, y - b, z]]
+    room.builder.quad(np.array(corners), glow, emission=float(rng.uniform(3, 9)))
+
+
 def _lights(room: Room) -> list[Light]:
     """One to three lamps under the ceiling, and perhaps the sun through a window."""
     rng, size = room.rng, room.size
@@ -260,7 +310,8 @@ def _lights(room: Room) -> list[Light]:
             [*rng.uniform(0.2, 0.8, 2) * size[:2], size[2] - rng.uniform(0.05, 0.4)]
         )
         direction = np.array([*rng.normal(0, 0.15, 2), -1.0])
-        warm = np.array([1.0, rng.uniform(0.75, 1.0), rng.uniform(0.5, 1.05)])
+        _lamp(room, position)
+        warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 1.05)])
         color, cone = warm * rng.uniform(1.5, 7.0), float(rng.uniform(120, 170))
         lights.append(Light(position, direction / np.linalg.norm(direction), color, cone))
     if rng.random() < 0.5:

@@ -43,7 +43,7 @@ float lit_share(int i, vec3 n) {
     vec4 p = light_matrix[i] * vec4(position + 0.03 * n, 1.0);
     if (p.w <= 0.0) return 0.0;
     vec3 q = p.xyz / p.w * 0.5 + 0.5;
-    if (any(lessThan(q.xy, vec2(0.0))) || any(greaterThan(q.xy, vec2(1.0)))) return 0.0;
+    if (any(lessThan(q.xy, vec2(0.0))) || any(greaterThan(q.xy, vec2(1.0)))) return 1.0;
     float sum = 0.0; float step = 1.5 / SHADOW_SIZE; vec2 tile = vec2(i % 2, i / 2);
     for (int y = -1; y <= 1; y += 2) for (int x = -1; x <= 1; x += 2) {
         vec2 at = clamp(q.xy + vec2(x, y) * step, vec2(step), vec2(1.0 - step));
@@ -72,7 +72,7 @@ void main() {
         for (int i = 0; i < light_count; i++) {
             vec3 l = light_position[i] - position; float d2 = dot(l, l); l *= inversesqrt(d2);
             float aim = -dot(l, light_direction[i]);
-            float cone = smoothstep(light_cosine[i], light_cosine[i] + 0.15, aim);
+            float cone = smoothstep(light_cosine[i], light_cosine[i] + 0.35, aim);
             float facing = max(dot(n, l), 0.0);
             if (cone * facing <= 0.0) continue;
             vec3 incoming = light_color[i] * cone * lit_share(i, n) / (0.5 + d2);
@@ -87,7 +87,7 @@ void main() {
     vec3 radiance = exposure * (albedo * (light + emission) + shine);
     radiance = radiance * (1.0 + radiance / 9.0) / (1.0 + radiance);
     vec3 tone = sqrt(radiance);
-    vec3 steep = clamp(tone * 1.1, 0.0, 1.0); steep *= steep * (3.0 - 2.0 * steep);
+    vec3 steep = clamp(tone * 1.12, 0.0, 1.0); steep *= steep * (3.0 - 2.0 * steep);
     out_color = vec4(mix(tone, steep, contrast), alpha);
     out_depth = depth;
 }

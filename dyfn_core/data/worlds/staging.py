@@ -121,7 +121,7 @@ def _way(
     points = [p for p in floor if p is not None]
     if len(points) < count or np.abs(np.diff([p[2] for p in points])).max() > STEP_HEIGHT:
         return None
-    if not _roomy(space, np.array(points), actor):
+    if not _roomy(space, np.array(points), actor) or not _wide(space, start):
         return None
     return Way(
         actor=index,
@@ -139,6 +139,14 @@ def _floor(space: FreeSpace, point: np.ndarray) -> np.ndarray | None:
     """What lies below a free point, at most 2.5 m; None otherwise."""
     drop = float(space.distance(point[None], np.array([[0.0, 0, -1]]))[0])
     return None if drop >= min(FAR, 2.5) else point - [0, 0, drop]
+
+
+def _wide(space: FreeSpace, start: np.ndarray) -> bool:
+    """Whether the floor goes on around a point: it is no table top."""
+    around = np.arange(8) * np.pi / 4
+    ring = start + 0.6 * np.column_stack([np.cos(around), np.sin(around), np.zeros(8)])
+    drops = space.distance(ring + np.array([0, 0, 0.1]), np.tile([0.0, 0, -1.0], (8, 1)))
+    return int((drops > 0.1 + STEP_HEIGHT).sum()) <= 1
 
 
 def _roomy(space: FreeSpace, points: np.ndarray, actor: Actor) -> bool:

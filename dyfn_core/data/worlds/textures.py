@@ -23,6 +23,12 @@ def wood_color(rng: np.random.Generator) -> Color:
     return cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0]
 
 
+def neutral_color(rng: np.random.Generator) -> Color:
+    """White, grey and beige as on most walls, ceilings and office furniture."""
+    grey = 1 - rng.beta(1.2, 3.0) * 0.75
+    return np.clip(grey * (1 + rng.normal(0, 0.02) * np.array([1.0, 0.0, -1.0])), 0, 1)
+
+
 def clouds(rng: np.random.Generator, octaves: int = 5, stretch: int = 1) -> np.ndarray:
     """N x N tiling noise in about -1..1; stretch lengthens it along x."""
     out = np.zeros((N, N), np.float32)
@@ -50,6 +56,17 @@ def plaster(rng: np.random.Generator) -> np.ndarray:
     grain = rng.normal(size=(N, N)).astype(np.float32)
     relief = clouds(rng) * 0.4 + grain * 0.3
     return _shade(muted_color(rng), relief, rng.uniform(0.01, 0.12))
+
+
+def paint(rng: np.random.Generator) -> np.ndarray:
+    """A painted wall or ceiling."""
+    grain = rng.normal(size=(N, N)).astype(np.float32)
+    return _shade(neutral_color(rng), clouds(rng) * 0.4 + grain * 0.3, rng.uniform(0.01, 0.05))
+
+
+def cardboard(rng: np.random.Generator) -> np.ndarray:
+    color = np.array([0.72, 0.56, 0.38]) * rng.uniform(0.7, 1.15)
+    return _shade(np.clip(color, 0, 1), clouds(rng), rng.uniform(0.02, 0.1))
 
 
 def carpet(rng: np.random.Generator) -> np.ndarray:
@@ -117,6 +134,63 @@ def picture(rng: np.random.Generator) -> np.ndarray:
     return image
 
 
+def document(rng: np.random.Generator) -> np.ndarray:
+    """A printed page: lines of text, perhaps a figure."""
+    image = np.full((N, N, 3), int(rng.integers(215, 256)), np.uint8)
+    ink = tuple(int(x) for x in rng.integers(0, 90, 3))
+    y = 18
+    while y < N - 16:
+        if rng.random() < 0.1:
+            high = int(rng.integers(30, 80))
+            color = tuple(int(255 * c) for c in muted_color(rng))
+            cv2.rectangle(image, (24, y), (int(rng.integers(110, N - 24)), y + high), color, -1)
+            y += high + 12
+        end = int(rng.integers(60, N - 20))
+        for x in range(22, end, 9):
+            cv2.line(image, (x, y), (min(x + int(rng.integers(3, 8)), end), y), ink, 2)
+        y += int(rng.choice([8, 8, 8, 16]))
+    return image
+
+
+def screen(rng: np.random.Generator) -> np.ndarray:
+    """What a monitor shows: a background, windows, text."""
+    image = _shade(muted_color(rng), clouds(rng, 3), rng.uniform(0.05, 0.5))
+    for _ in range(int(rng.integers(1, 4))):
+        x, y = (int(v) for v in rng.integers(0, 120, 2))
+        w, h = (int(v) for v in rng.integers(70, 220, 2))
+        light = rng.random() < 0.6
+        page = document(rng) if light else 255 - document(rng)
+        part = cv2.resize(page, (w, h), interpolation=cv2.INTER_AREA)
+        image[y : y + h, x : x + w] = part[: N - y, : N - x]
+        cv2.rectangle(image, (x, y), (x + w, y + 7), (90, 100, 120), -1)
+    return image
+
+
+def keys(rng: np.random.Generator) -> np.ndarray:
+    """The keys of a keyboard."""
+    dark = int(rng.integers(10, 70))
+    base, key = (dark, dark + 30) if rng.random() < 0.6 else (150, 225)
+    image = np.full((N, N, 3), base, np.uint8)
+    for row in range(5):
+        for column in range(14):
+            x, y = int(column * N / 14), int(row * N / 5)
+            cv2.rectangle(image, (x + 2, y + 5), (x + 15, y + 45), (key,) * 3, -1)
+    return image
+
+
+def whiteboard(rng: np.random.Generator) -> np.ndarray:
+    """A board with marker strokes in a frame."""
+    image = np.full((N, N, 3), int(rng.integers(225, 250)), np.uint8)
+    inks = [(20, 20, 30), (20, 40, 160), (180, 30, 30), (20, 120, 50)]
+    for _ in range(int(rng.integers(0, 30))):
+        start = rng.integers(15, N - 40, 2)
+        steps = np.cumsum(rng.normal(0, 7, (12, 2)) + np.array([6, 0]), axis=0)
+        line = np.clip(start + steps, 10, N - 10).astype(np.int32)
+        cv2.polylines(image, [line], False, inks[rng.integers(4)], 2, cv2.LINE_AA)
+    cv2.rectangle(image, (0, 0), (N - 1, N - 1), (150, 150, 155), 8)
+    return image
+
+
 def books(rng: np.random.Generator) -> np.ndarray:
     image, x = np.zeros((N, N, 3), np.uint8), 0
     while x < N:
@@ -130,7 +204,10 @@ def books(rng: np.random.Generator) -> np.ndarray:
 def window(rng: np.random.Generator) -> np.ndarray:
     """The bright, blurred outdoors behind a window."""
     y = np.linspace(0, 1, N)[:, None, None]
-    sky, ground = np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1), muted_color(rng) * 0.8
+    sky, ground = (
+        np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1),
+        (0.25 * muted_color(rng) + np.array([0.26, 0.32, 0.18]) * rng.uniform(0.4, 1.5)),
+    )
     horizon = rng.uniform(0.4, 0.9) + 0.15 * clouds(rng, 3)[..., None]
     share = 1 / (1 + np.exp(-(y - horizon) * 20))
     return _shade(sky * (1 - share) + ground * share, clouds(rng, 4), 0.3)
