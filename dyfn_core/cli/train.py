@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from dyfn_core.cli import experiments
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
 from dyfn_core.evaluation.controls import VariantScore, score_variants, variant_table
@@ -22,6 +23,7 @@ from dyfn_core.training.config import (
     read_config,
 )
 from dyfn_core.training.processes import Processes
+from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
 from dyfn_core.training.stabilizer import StabilizerTask
 from dyfn_core.training.trainer import InterruptedRunError, Task, Trainer, TrainingError
 
@@ -34,6 +36,12 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         if options.command == "evaluate":
             print(variant_table(_evaluate(options)))
+            return 0
+        if options.command == "experiments":
+            experiments.run(options)
+            return 0
+        if options.command == "curve":
+            _curve(options)
             return 0
         _trainer(options).train(options.max_steps)
     except InterruptedRunError as stop:
@@ -80,6 +88,18 @@ def _data_override(given: list[str]) -> list[str]:
     return [f"data={json.dumps(sets)}"]
 
 
+def _curve(options: argparse.Namespace) -> None:
+    rows = scaling_curve(options.run, options.metric, options.config)
+    out = options.out or options.run
+    out.mkdir(parents=True, exist_ok=True)
+    write_csv(rows, out / "scaling_curve.csv")
+    draw_curve(rows, out / "scaling_curve.png", options.run.resolve().name)
+    for metric in [name for name in rows[-1] if name not in ("step", "images")]:
+        doubled = last_doubling(rows, metric)
+        told = "" if doubled is None else f", {doubled[0]:.4f} at half the images"
+        print(f"{metric}: {rows[-1][metric]:.4f} after {rows[-1]['images']:.0f} images{told}")
+
+
 def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]:
     model = load_model(options.model)
     results = {}
@@ -120,6 +140,12 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
         )
+    experiments.add_parser(commands)
+    command = commands.add_parser("curve", help="images seen against error of a run: CSV and PNG")
+    command.add_argument("run", type=Path, help="folder of a run, with its log.jsonl")
+    command.add_argument("--metric", action="append", default=[], help="default: all logged")
+    command.add_argument("--config", type=Path, help="of the run, if its folder has none")
+    command.add_argument("--out", type=Path, help="folder for both files (default: the run's)")
     command = commands.add_parser(
         "evaluate", help="a model and its controls under the image and video protocols"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -127,7 +128,11 @@ class BatchLoader:
     def __init__(self, source: ClipSource, start: int = 0) -> None:
         find_sequences(source, "train")  # opened here, so that the process inherits it
         loader = DataLoader(
-            ClipBatches(source, start), batch_size=None, num_workers=1, prefetch_factor=6
+            ClipBatches(source, start),
+            batch_size=None,
+            num_workers=1,
+            prefetch_factor=6,
+            worker_init_fn=_leave_signals_to_the_run,
         )
         self._batches = iter(loader)
         self.unreadable: Counter[str] = Counter()
@@ -143,6 +148,11 @@ class BatchLoader:
                 logger.warning("another clip was drawn instead: %s", message)
             self.unreadable[message] += 1
         return batch
+
+
+def _leave_signals_to_the_run(worker: int) -> None:
+    """Out of the process group, so that Ctrl-C reaches the run alone, which then stops in order."""
+    os.setpgid(0, 0)
 
 
 def find_sequences(source: ClipSource, split: str) -> DataPool:

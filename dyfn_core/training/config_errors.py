@@ -43,14 +43,14 @@ def _sentence(problem: Any, kind: type[BaseModel]) -> str:
 
 
 def _nearest(place: tuple[Any, ...], kind: type[BaseModel]) -> str:
-    """ ", did you mean ...?": a name of the same level, else the same name of another one."""
+    """ ", did you mean ...?": the same name of another level, else a similar one of this."""
     level: type[BaseModel] | None = kind
     for part in place[:-1]:
         if level is not None and part in level.model_fields:
             level = next(_models(level.model_fields[part].annotation), None)
     own = list(level.model_fields) if level is not None else []
-    found = difflib.get_close_matches(str(place[-1]), own, n=1)
-    found = found or [name for name in _paths(kind) if name.rpartition(".")[2] == place[-1]]
+    found = [name for name in _paths(kind) if name.rpartition(".")[2] == place[-1]]
+    found += difflib.get_close_matches(str(place[-1]), own, n=1)
     return f", did you mean {found[0]!r}?" if found else ""
 
 

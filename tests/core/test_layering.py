@@ -22,6 +22,17 @@ MAY_IMPORT = {
     "data": {"prediction", "geometry"},
     "training": {"prediction", "geometry", "models", "losses", "data"},
     "evaluation": {"prediction", "geometry", "models", "stream", "data", "metric"},
+    "experiments": {
+        "prediction",
+        "geometry",
+        "models",
+        "stream",
+        "losses",
+        "data",
+        "metric",
+        "training",
+        "evaluation",
+    },
 }
 ROS = {"rclpy", "rosbags", "mcap", "sensor_msgs", "std_msgs", "std_srvs", "geometry_msgs"}
 

@@ -8,7 +8,6 @@ import random
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import pytest
 import torch
 import training_toys
 import yaml
-from training_toys import ToyTask, environment, run_toy, toy_config
+from training_toys import PATIENCE, ToyTask, environment, run_toy, toy_config, wait_for_step
 
 from dyfn_core.models.checkpoints import read_checkpoint
 from dyfn_core.training.checkpoint import (
@@ -29,7 +28,6 @@ from dyfn_core.training.checkpoint import (
 from dyfn_core.training.run_folder import read_log
 from dyfn_core.training.trainer import InterruptedRunError, Trainer, TrainingError
 
-PATIENCE = 300.0
 LONG: dict[str, Any] = {"steps": 120, "validate_every": 50, "picture_every": 1000}
 
 
@@ -66,16 +64,6 @@ def losses(out: Path) -> list[tuple[int, float]]:
 def start(out: Path, resume: str = "new", **changes: object) -> subprocess.Popen[bytes]:
     command = [sys.executable, training_toys.__file__, str(out), resume, json.dumps(changes)]
     return subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE)
-
-
-def wait_for_step(process: subprocess.Popen[bytes], out: Path, step: int) -> None:
-    """Until the run has logged a step. Looks at the log, which is what a user could look at."""
-    end = time.monotonic() + PATIENCE
-    log = out / "log.jsonl"
-    while not (log.exists() and f'"step": {step},' in log.read_text()):
-        assert process.poll() is None, "the run ended before it was killed"
-        assert time.monotonic() < end, f"no step {step} within {PATIENCE} s"
-        time.sleep(0.002)
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 import training_toys
-from training_toys import ToyTask, environment, run_toy, toy_config
+from training_toys import PATIENCE, ToyTask, environment, run_toy, toy_config
 
 from dyfn_core.models.checkpoints import read_checkpoint
 from dyfn_core.training.checkpoint import read_state
@@ -19,7 +19,6 @@ from dyfn_core.training.config import ConfigError
 from dyfn_core.training.processes import Processes
 from dyfn_core.training.run_folder import read_log
 
-PATIENCE = 300.0
 TOLERANCE = 2e-6  # float32 sums in another order, after six steps of AdamW at 1e-2
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,13 +15,17 @@ from typing import Any
 import numpy as np
 import torch
 from conftest import PinholeModel
+from made_frames import write_shard
 from torch import Tensor
 
+from dyfn_core.models.checkpoints import save_model
+from dyfn_core.models.mini import MiniConfig, MiniModel
 from dyfn_core.training.config import RunConfig
 from dyfn_core.training.processes import Processes, share_of
 from dyfn_core.training.trainer import Task, Trainer
 
 BATCH = 4
+PATIENCE = 300.0  # seconds for what another process does
 
 
 @dataclass(frozen=True)
@@ -95,10 +101,52 @@ def run_toy(out: Path, resume: bool = False, **changes: Any) -> Trainer:
     return trainer
 
 
+def tiny_base(place: Path) -> MiniModel:
+    """A random model, saved as base.safetensors, whose depth depends on its latent."""
+    torch.manual_seed(0)
+    config = MiniConfig(latent_channels=8, stage_channels=(8, 8), context_channels=12, num_tokens=8)
+    model = MiniModel(config).eval()
+    torch.nn.init.normal_(model.decoder.points[2].weight, std=0.1)  # type: ignore[arg-type]
+    save_model(model, place / "base.safetensors")
+    return model
+
+
+def tiny_stabilizer_settings(place: Path) -> dict[str, Any]:
+    """Settings of `dyfn-train stabilizer` for tiny_base, with rendered clips made in data/."""
+    write_shard(place / "data", "a_1", "clip", "train", 8, seed=2)
+    write_shard(place / "data", "b_1", "clip", "held_out", 5, seed=4)
+    return {
+        "base": str(place / "base.safetensors"),
+        "data": [str(place / "data")],
+        "stages": [{"from_step": 0, "batch": 1, "sizes": [[32, 64]]}],
+        "stabilizer": {"hidden": 4, "pool": 2, "form": "residual"},
+        "cache_draws": 1,
+        "cache_length": 4,
+        "length": 3,
+        "decoded": 2,
+        "clips": 1,
+        "strides": [1, 2],
+        "steps": 2,
+        "threads": 1,
+        "device": "cpu",
+        "validation_clips": 1,
+    }
+
+
 def environment() -> dict[str, str]:
     """What a subprocess needs to find this module and to compute as this process does."""
     places = [str(Path(__file__).parent), *filter(None, sys.path)]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
+
+
+def wait_for_step(process: subprocess.Popen[bytes], out: Path, step: int) -> None:
+    """Until the run has logged a step. Looks at the log, which is what a user could look at."""
+    end = time.monotonic() + PATIENCE
+    log = out / "log.jsonl"
+    while not (log.exists() and f'"step": {step},' in log.read_text()):
+        assert process.poll() is None, "the run ended before it was killed"
+        assert time.monotonic() < end, f"no step {step} within {PATIENCE} s"
+        time.sleep(0.002)
 
 
 if __name__ == "__main__":

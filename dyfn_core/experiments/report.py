@@ -1,0 +1,148 @@
+"""Tables of experiments, written between markers into a Markdown file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dyfn_core.evaluation.controls import VariantScore, gap_closed
+from dyfn_core.experiments.declared import Experiment
+from dyfn_core.experiments.runner import ArmScores
+from dyfn_core.experiments.scenes import BASE_ROWS
+from dyfn_core.experiments.statistics_grid import StatisticsGrid
+
+HEADING = "## Experiments"
+METRICS = ("image_abs_rel", "video_abs_rel", "video_delta1")
+TITLES = ("image AbsRel", "video AbsRel", "video delta1", "gap closed")
+
+
+def trained_table(
+    controls: Mapping[str, Mapping[str, VariantScore]], arms: Mapping[str, ArmScores]
+) -> str:
+    """Controls, then arms as mean ± standard deviation over seeds; four columns a data set."""
+    head = ["", *(f"{data} {title}" for data in controls for title in TITLES)]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for name in BASE_ROWS:
+        cells = [name]
+        for row in controls.values():
+            cells += [f"{getattr(row[name], metric):.3f}" for metric in METRICS]
+            learned = name in ("ema", "frozen")
+            closed = [100 * gap_closed(dict(row), name)]
+            cells.append(mean_spread(closed, digits=0, unit="%") if learned else "")
+        lines.append(f"| {' | '.join(cells)} |")
+    for name, arm in arms.items():
+        cells = [f"**{name}**"]
+        for data, row in controls.items():
+            cells += _arm_cells(row, arm.scores.get(data, []))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _arm_cells(controls: Mapping[str, VariantScore], scores: Sequence[VariantScore]) -> list[str]:
+    if not scores:
+        return ["failed"] * len(TITLES)
+    cells = [mean_spread([getattr(s, metric) for s in scores]) for metric in METRICS]
+    closed = [100 * gap_closed({**controls, "dyfn": score}) for score in scores]
+    return [*cells, mean_spread(closed, digits=0, unit="%")]
+
+
+def mean_spread(values: Sequence[float], digits: int = 3, unit: str = "") -> str:
+    """Mean ± standard deviation; the mean alone for a single value."""
+    mean = f"{round(float(np.mean(values)), digits) + 0.0:.{digits}f}"  # + 0.0: no minus zero
+    spread = f" ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else ""
+    return f"{mean}{spread}{unit}"
+
+
+def verdicts(
+    controls: Mapping[str, Mapping[str, VariantScore]], arms: Mapping[str, ArmScores]
+) -> list[str]:
+    """A sentence per data set and arm: the first against the best control, others against it."""
+    found = []
+    for data, row in controls.items():
+        first: list[float] = []
+        for name, arm in arms.items():
+            values = [score.video_abs_rel for score in arm.scores.get(data, [])]
+            if not values:
+                continue
+            if not first:
+                first, rival = values, min(("base", "ema", "frozen"), key=_video(row))
+                found.append(f"{data}: {name} {_compare(values, [_video(row)(rival)], rival)}.")
+            else:
+                found.append(f"{data}: {name} {_compare(values, first, next(iter(arms)))}.")
+    for name, arm in arms.items():
+        found += [f"{name}, seed {seed}, failed: {why}." for seed, why in arm.failed.items()]
+    return found
+
+
+def _video(row: Mapping[str, VariantScore]) -> Callable[[str], float]:
+    return lambda name: row[name].video_abs_rel
+
+
+def _compare(ours: Sequence[float], theirs: Sequence[float], name: str) -> str:
+    """How two sets of runs differ in video AbsRel, next to the spread of their seeds."""
+    difference = float(np.mean(ours) - np.mean(theirs))
+    spreads = [np.std(v, ddof=1) for v in (ours, theirs) if len(v) > 1]
+    if not spreads:
+        return f"{difference:+.3f} video AbsRel against {name} (one seed: no spread)"
+    spread = float(max(spreads))
+    judged = "within" if abs(difference) <= spread else "beyond"
+    return (
+        f"{difference:+.3f} video AbsRel against {name}, {judged} the seeds' spread ({spread:.3f})"
+    )
+
+
+def length_table(curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str:
+    """curves: row -> number of frames -> one value a seed."""
+    lengths = sorted({length for row in curves.values() for length in row})
+    head = ["video AbsRel of the first", *(f"{length} frames" for length in lengths)]
+    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
+    for name, row in curves.items():
+        cells = [mean_spread(row[length]) if length in row else "" for length in lengths]
+        lines.append(f"| {' | '.join([name, *cells])} |")
+    return "\n".join(lines)
+
+
+def grid_table(grid: StatisticsGrid) -> str:
+    """The ranges over the grid, and its corners."""
+    lines = ["| over a, b | lowest | highest | a = b = 1 |", "| --- | --- | --- | --- |"]
+    centre = grid.factors.index(1.0)
+    parts = {
+        "scale": grid.scale,
+        "shift / median depth": grid.shift,
+        "AbsRel after alignment": grid.abs_rel,
+    }
+    for name, values in parts.items():
+        middle = values[centre, centre]
+        lines.append(f"| {name} | {values.min():.3f} | {values.max():.3f} | {middle:.3f} |")
+    return "\n".join(lines)
+
+
+def section(experiment: Experiment, body: Sequence[str], command: str) -> str:
+    """The text of one experiment."""
+    parts = [f"### {experiment.question}", *body, f"    {command}", f"Paper: {experiment.paper}"]
+    return "\n\n".join(parts)
+
+
+def write_section(path: Path, name: str, text: str) -> None:
+    """Replace what is between the markers of an experiment; a new one goes to the end.
+
+    The rest of the file is not touched. Raises ValueError when a marker lacks its partner.
+    """
+    first, last = f"<!-- experiment: {name} -->", f"<!-- end of experiment: {name} -->"
+    content = path.read_text(encoding="utf-8") if path.exists() else ""
+    if (first in content) != (last in content):
+        raise ValueError(f"{path}: only one of {first} and {last} is there")
+    block = f"{first}\n{text}\n{last}"
+    if first in content:
+        pattern = re.escape(first) + r".*?" + re.escape(last)
+        content = re.sub(pattern, lambda _: block, content, count=1, flags=re.DOTALL)
+    else:
+        if HEADING not in content.splitlines():
+            content = f"{content.rstrip()}\n\n{HEADING}\n".lstrip()
+        content = f"{content.rstrip()}\n\n{block}\n"
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(content, encoding="utf-8")
+    partial.replace(path)

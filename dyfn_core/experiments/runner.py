@@ -1,0 +1,197 @@
+"""Trains the arms of experiments, each once, and scores them with their controls."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dyfn_core.data.clips import find_sequences
+from dyfn_core.data.frames import FrameSequence
+from dyfn_core.data.sequences import folder_frames
+from dyfn_core.evaluation.controls import VariantScore
+from dyfn_core.experiments.declared import Arm
+from dyfn_core.experiments.scenes import Scene, encode_scene, score_controls, score_stabilizer
+from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.checkpoints import load_model
+from dyfn_core.models.stabilizer import StabilizerConfig
+from dyfn_core.training.base import clip_source
+from dyfn_core.training.checkpoint import has_state
+from dyfn_core.training.config import StabilizerRunConfig, read_config
+from dyfn_core.training.processes import Processes
+from dyfn_core.training.run_folder import RESULTS_FILE
+from dyfn_core.training.stabilizer import StabilizerTask
+from dyfn_core.training.trainer import MODEL_FILE, Trainer, TrainingError
+
+HELD_OUT = "held-out clips"
+CACHE_SEED = 0  # one cache serves the runs of all seeds
+BOOKKEEPING = {"seed", "cache", "cache_seed"}  # what the runs of one arm may differ in
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What experiments have in common.
+
+    config: YAML file of a StabilizerRunConfig; overrides: KEY=VALUE on top of it. out: folder of
+    all runs. seeds: how often each arm is trained. recordings: folders to score on besides the
+    held-out clips of the config's data, of which `clips` are taken; stride: every so-many-th
+    frame of either.
+    """
+
+    config: Path
+    overrides: tuple[str, ...]
+    out: Path
+    seeds: int
+    recordings: tuple[Path, ...] = ()
+    clips: int = 12
+    stride: int = 4
+
+
+@dataclass
+class ArmScores:
+    """data set -> score of each seed's run; failed: seed -> why it has none."""
+
+    scores: dict[str, list[VariantScore]] = field(default_factory=dict)
+    failed: dict[int, str] = field(default_factory=dict)
+
+
+class Runner:
+    """Runs and scores arms under one plan; what is finished on disk is not done again.
+
+    Raises ConfigError when the plan's config cannot be used, FileNotFoundError when there is
+    nothing to score on.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.config = self._settings(Arm(""), 0)
+        self.model = load_model(self.config.base)
+        self.model.stabilizer = None
+        self._scenes: dict[str, list[Scene]] = {}
+
+    def scenes(self) -> dict[str, list[Scene]]:
+        """Data set -> its encoded sequences."""
+        if not self._scenes:
+            self._scenes = encode_all(self.model, self.config, self.plan, self.plan.stride)
+        return self._scenes
+
+    def controls(self) -> dict[str, dict[str, VariantScore]]:
+        """Data set -> control -> score."""
+        path = self.plan.out / f"controls_{self._measure()}.json"
+        if not path.exists():
+            found = {name: score_controls(self.model, s) for name, s in self.scenes().items()}
+            plain = {n: {k: asdict(v) for k, v in row.items()} for n, row in found.items()}
+            _write_json(path, plain)
+        return {
+            name: {control: VariantScore(**score) for control, score in row.items()}
+            for name, row in json.loads(path.read_text()).items()
+        }
+
+    def arm(self, arm: Arm) -> ArmScores:
+        """Train and score an arm with every seed. A run that fails is reported, not raised."""
+        found = ArmScores()
+        for seed in range(self.plan.seeds):
+            try:
+                folder = self.train(arm, seed)
+            except TrainingError as error:
+                logger.warning("%s, seed %d: %s", arm.name, seed, error)
+                found.failed[seed] = str(error)
+                continue
+            for name, score in self._scores(folder).items():
+                found.scores.setdefault(name, []).append(score)
+        return found
+
+    def train(self, arm: Arm, seed: int) -> Path:
+        """The folder of a finished run of an arm; it goes on where it stopped, if it did."""
+        config = self._settings(arm, seed)
+        folder = self.plan.out / "runs" / _digest(config) / f"seed_{seed}"
+        if (folder / RESULTS_FILE).exists():
+            logger.info("%s, seed %d: finished before", arm.name, seed)
+            return folder
+        logger.info("%s, seed %d", arm.name, seed)
+        processes = Processes(config)
+        with processes.main_first():
+            task = StabilizerTask(config, self.plan.out / "latents", processes.device)
+        Trainer(task, config, folder, has_state(folder), processes).train()
+        return folder
+
+    def _scores(self, folder: Path) -> dict[str, VariantScore]:
+        path = folder / f"scores_{self._measure()}.json"
+        if not path.exists():
+            stabilizer = load_model(folder / MODEL_FILE, self.model.device).stabilizer
+            found = {
+                name: asdict(score_stabilizer(self.model, scenes, stabilizer))
+                for name, scenes in self.scenes().items()
+            }
+            _write_json(path, found)
+        return {name: VariantScore(**s) for name, s in json.loads(path.read_text()).items()}
+
+    def _settings(self, arm: Arm, seed: int) -> StabilizerRunConfig:
+        own = {
+            **arm.overrides,
+            "seed": seed,
+            "cache_seed": CACHE_SEED,
+            "cache": str(self.plan.out / "latents"),
+        }
+        overrides = [f"{key}={json.dumps(value)}" for key, value in own.items()]
+        return read_config(
+            self.plan.config, StabilizerRunConfig, [*self.plan.overrides, *overrides]
+        )
+
+    def _measure(self) -> str:
+        """Short name of what is scored on, and with which base."""
+        plan = self.plan
+        places = [str(path.resolve()) for path in plan.recordings]
+        data = self.config.model_dump(mode="json")["data"]
+        told = [str(self.config.base), data, places, plan.clips, plan.stride]
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:8]
+
+
+def encode_all(
+    model: GeometryModel, config: StabilizerRunConfig, plan: Plan, stride: int
+) -> dict[str, list[Scene]]:
+    """The plan's recordings, and held-out clips of the config's data, by data set.
+
+    Raises FileNotFoundError when there is neither.
+    """
+    found: dict[str, list[Scene]] = {}
+    source = clip_source(config, 2, (1, 1))
+    try:
+        sequences = find_sequences(source, "held_out").sequences[: plan.clips]
+    except FileNotFoundError as error:
+        if not plan.recordings:
+            raise
+        logger.warning("scoring on recordings only: %s", error)
+        sequences = []
+    if sequences:
+        found[HELD_OUT] = [
+            encode_scene(model, sequence.name, _frames(sequence, stride)) for sequence in sequences
+        ]
+    for folder in plan.recordings:
+        found[folder.name] = [encode_scene(model, folder.name, folder_frames(folder, stride))]
+    return found
+
+
+def _frames(sequence: FrameSequence, stride: int) -> Any:
+    for index in range(0, len(sequence), stride):
+        frame = sequence.read(index)
+        yield frame.image, frame.depth
+
+
+def _digest(config: StabilizerRunConfig) -> str:
+    """Short name of an arm's settings; arms of different experiments that agree share runs."""
+    plain: dict[str, Any] = config.model_dump(mode="json", exclude=BOOKKEEPING)
+    plain["stabilizer"] = StabilizerConfig(**config.stabilizer).to_dict()
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _write_json(path: Path, values: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(values, indent=1) + "\n")
+    partial.replace(path)

@@ -1,0 +1,227 @@
+"""Training DyFN: what has gradients, the latent cache, precision, and curves of a run."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from training_toys import (
+    PATIENCE,
+    environment,
+    tiny_base,
+    tiny_stabilizer_settings,
+    wait_for_step,
+)
+
+from dyfn_core.cli.train import main
+from dyfn_core.data.clips import draw_batch, find_sequences
+from dyfn_core.training.checkpoint import read_state
+from dyfn_core.training.config import (
+    BaseRunConfig,
+    ConfigError,
+    StabilizerRunConfig,
+    read_config,
+)
+from dyfn_core.training.latents import encode_clips
+from dyfn_core.training.run_folder import read_log
+from dyfn_core.training.scaling_curve import images_at, last_doubling
+from dyfn_core.training.stabilizer import StabilizerTask
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """base.safetensors, data/ and config.yaml."""
+    folder = tmp_path_factory.mktemp("stabilizer")
+    tiny_base(folder)
+    settings = tiny_stabilizer_settings(folder) | {
+        "stabilizer": {"hidden": 4, "pool": 2, "form": "residual"},
+        "length": 4,
+        "decoded": 4,
+        "log_every": 1,
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(settings))
+    return folder
+
+
+def settings(place: Path, *overrides: str) -> StabilizerRunConfig:
+    return read_config(place / "config.yaml", StabilizerRunConfig, list(overrides))
+
+
+@pytest.fixture
+def task(place: Path) -> StabilizerTask:
+    """With heads that do something, so that the gradient reaches every parameter."""
+    task = StabilizerTask(settings(place), place / "latents")
+    torch.manual_seed(5)
+    assert task.model.stabilizer is not None
+    for head in (task.model.stabilizer.gamma_head, task.model.stabilizer.beta_head):
+        torch.nn.init.normal_(head.weight, std=0.1)  # type: ignore[union-attr,arg-type]
+    return task
+
+
+def gradients(task: StabilizerTask, batch: object) -> torch.Tensor:
+    """DyFN's gradient as one vector."""
+    task.model.zero_grad(set_to_none=True)
+    torch.manual_seed(11)
+    task.loss(batch)[0].backward()  # type: ignore[arg-type]
+    assert task.model.stabilizer is not None
+    return torch.cat([p.grad.flatten() for p in task.model.stabilizer.parameters()])  # type: ignore[union-attr]
+
+
+def test_only_dyfn_has_gradients(task: StabilizerTask) -> None:
+    gradients(task, next(task.batches(0)))
+    for name, parameter in task.model.named_parameters():
+        assert (parameter.grad is not None) == name.startswith("stabilizer.")
+        assert parameter.grad is None or float(parameter.grad.abs().sum()) > 0
+    trained = {id(p) for group in task.groups() for p in group["params"]}
+    assert trained == {id(p) for p in task.model.parameters() if p.requires_grad}
+
+
+def test_gradients_agree_with_those_without_a_cache(task: StabilizerTask) -> None:
+    assert task.cache is not None
+    cached = task.cache.entries[0]
+    images = draw_batch(task.source, find_sequences(task.source, "train"), 0)
+    fresh = encode_clips(task.model, images)
+    assert torch.equal(cached.latent, fresh.latent)
+    ours = gradients(task, cached)
+    assert float(ours.norm()) > 1e-4
+    assert torch.equal(ours, gradients(task, fresh))
+    # The cache rounds latents to float16: this is all that it changes.
+    size = (images.image.shape[-2], images.image.shape[-1])
+    with torch.no_grad():
+        exact = torch.stack(
+            [task.model.encode_at(clip.float() / 255, size).features for clip in images.image]
+        )
+    assert not torch.equal(exact, fresh.latent.float())
+    unrounded = gradients(task, replace(fresh, latent=exact))
+    assert float((ours - unrounded).norm() / unrounded.norm()) < 0.01
+
+
+def test_run_without_a_cache_encodes_clips_of_its_own(place: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    config = [str(place / "config.yaml"), "--out", str(out), "--set", "cache_draws=0"]
+    assert main(["stabilizer", *config]) == 0
+    lines = [line for line in read_log(out / "log.jsonl") if line["group"] == "train"]
+    assert [line["images"] for line in lines] == [4, 8]
+    assert not (out / "latents").exists()
+
+
+def test_signal_to_the_whole_process_group_leaves_a_checkpoint(place: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    config = [str(place / "config.yaml"), "--out", str(out)]
+    sets = ["cache_draws=0", "steps=1000000", "checkpoint_minutes=1000", "validate_every=10000000"]
+    command = [sys.executable, "-m", "dyfn_core.cli.train", "stabilizer", *config]
+    command += [word for setting in sets for word in ("--set", setting)]
+    process = subprocess.Popen(
+        command, env=environment(), stderr=subprocess.PIPE, start_new_session=True
+    )
+    wait_for_step(process, out, 2)
+    os.killpg(process.pid, signal.SIGINT)
+    _, complaint = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 128 + signal.SIGINT
+    assert b"SIGINT: checkpoint written at step" in complaint
+    assert read_state(out)["step"] == read_log(out / "log.jsonl")[-1]["step"]
+
+
+def test_losses_are_float32_under_mixed_precision(task: StabilizerTask) -> None:
+    batch = next(task.batches(0))
+    seen = []
+    terms = task._terms
+
+    def watched(batch, points, frames):  # type: ignore[no-untyped-def]
+        seen.append((points.dtype, torch.is_autocast_enabled("cpu")))
+        return terms(batch, points, frames)
+
+    task._terms = watched  # type: ignore[method-assign]
+    exact = gradients(task, batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = gradients(task, batch)
+    assert seen == [(torch.float32, False)] * 2
+    assert not torch.equal(exact, rounded)
+    assert float(torch.nn.functional.cosine_similarity(exact, rounded, dim=0)) > 0.9
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("stabilizer.hiden=3", "unknown key 'hiden', did you mean 'hidden'"),
+        ("stabilizer.hidden=many", "hidden: .*integer"),
+        ("stabilizer.form=papre", "form 'papre' is unknown, expected one of"),
+        ("hidden=3", "unknown key 'hidden'"),
+        ("stages=[{from_step: 0, bacth: 1, sizes: [[32, 64]]}]", "did you mean 'batch'"),
+        ("from_step=3", "unknown key 'from_step', did you mean 'stages.from_step'"),
+        ("mixed_precision=bf61", "mixed_precision"),
+    ],
+)
+def test_bad_nested_settings_are_named(place: Path, override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        settings(place, override)
+
+
+def test_bad_model_settings_are_named(place: Path, tmp_path: Path) -> None:
+    values = {"data": ["x"], "steps": 1, "model": {"latent_chanels": 4}}
+    values["stages"] = [{"from_step": 0, "batch": 1, "sizes": [[32, 64]]}]
+    (tmp_path / "base.yaml").write_text(yaml.safe_dump(values))
+    with pytest.raises(ConfigError, match=r"model: .*did you mean 'latent_channels'"):
+        read_config(tmp_path / "base.yaml", BaseRunConfig, [])
+
+
+def write_log(run: Path, with_images: bool) -> None:
+    run.mkdir()
+    lines = []
+    for step, error in ((2, 0.4), (4, 0.3), (8, 0.25)):
+        images = {"images": 4 * step} if with_images else {}
+        lines.append({"step": step, "group": "train", "loss": 1.0, **images})
+        lines.append({"step": step, "group": "validation", "clips_abs_rel": error, **images})
+    (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+@pytest.mark.parametrize("with_images", [True, False])
+def test_curve_tells_images_seen_against_error(
+    tmp_path: Path, with_images: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = tmp_path / "run", tmp_path / "out"
+    write_log(run, with_images)
+    stages = [{"from_step": 0, "batch": 4, "sizes": [[32, 64]]}]
+    (run / "config.yaml").write_text(yaml.safe_dump({"stages": stages}))
+    assert main(["curve", str(run), "--out", str(out), "--metric", "clips_abs_rel"]) == 0
+    with (out / "scaling_curve.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["images"] for row in rows] == ["8", "16", "32"]
+    assert [float(row["clips_abs_rel"]) for row in rows] == [0.4, 0.3, 0.25]
+    assert (out / "scaling_curve.png").stat().st_size > 5000
+    assert "0.2500 after 32 images, 0.3000 at half the images" in capsys.readouterr().out
+
+
+def test_curve_of_something_else_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["curve", str(tmp_path)]) == 1
+    assert "no folder of a run" in capsys.readouterr().err
+    write_log(tmp_path / "run", with_images=False)
+    assert main(["curve", str(tmp_path / "run"), "--metric", "abs"]) == 1
+    assert "has no abs; it has clips_abs_rel" in capsys.readouterr().err
+    assert main(["curve", str(tmp_path / "run")]) == 1
+    assert "give --config" in capsys.readouterr().err
+
+
+def test_images_follow_from_the_stages() -> None:
+    stages = [{"from_step": 0, "batch": 16}, {"from_step": 10, "batch": 8}]
+    assert [images_at(stages, step) for step in (0, 5, 10, 12)] == [0, 80, 160, 176]
+
+
+def test_last_doubling_is_read_between_validations() -> None:
+    images = (10.0, 40.0, 40.0 * 2**0.5)
+    rows = [{"images": n, "e": e} for n, e in zip(images, (0.4, 0.2, 0.1), strict=True)]
+    half, end = last_doubling(rows, "e") or (0.0, 0.0)
+    assert half == pytest.approx(0.4 - 0.2 * 0.75)  # 28.3 is 1.5 of 2 octaves
+    assert end == 0.1
+    assert last_doubling(rows[:1], "e") is None
