@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,12 +19,14 @@ class View:
     image: H x W x 3 uint8 RGB. matrix: 3 x 3 float64 pixels, None when unknown.
     visible: H x W bool, False where undistortion had no pixel to take; None: all visible.
     info: the CameraInfo that describes the image as it is now; None when there is none.
+    lens: what was undone; None when nothing was.
     """
 
     image: np.ndarray
     matrix: np.ndarray | None = None
     visible: np.ndarray | None = None
     info: Any = None
+    lens: Calibration | None = None
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,29 @@ class Calibrator:
             self._key = key
         columns, rows, visible = self._maps
         flat = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return View(flat, calibration.matrix, visible)
+        return View(flat, calibration.matrix, visible, lens=calibration)
+
+
+def undistort_depth(depth: np.ndarray, view: View) -> np.ndarray:
+    """Depth registered with the image that a view was made from -> with the view.
+
+    depth: H' x W' float32 of the same field of view, NaN invalid; each pixel takes its nearest.
+    """
+    if view.lens is None:
+        return depth
+    height, width = depth.shape
+    scale = np.array([[width / view.image.shape[1]], [height / view.image.shape[0]], [1.0]])
+    matrix = view.lens.matrix * scale
+    matrix[:2, 2] += (scale[:2, 0] - 1) / 2  # pixel centres: c' = s (c + 1/2) - 1/2
+    columns, rows, _ = undistortion(replace(view.lens, matrix=matrix), height, width)
+    return cv2.remap(
+        depth,
+        columns,
+        rows,
+        cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=float("nan"),
+    )
 
 
 def _check_frame_id(image: str, info: str) -> None:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from dyfn_ros.encodings import MessageError
+from dyfn_ros.messages import depth_fields
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct("<iff")  # compressedDepth: format, then A and B of z = A / (value - B)
@@ -45,6 +46,33 @@ def decode_compressed_depth(message: Any) -> np.ndarray:
             metres = (inverse[0] / (values.astype(np.float32) - inverse[1])).astype(np.float32)
     valid = (values > 0) & np.isfinite(metres) & (metres > 0)
     return np.where(valid, metres, np.float32(np.nan))
+
+
+INVERSE_RESOLUTION = 100.0  # as compressed_depth_image_transport: depth_quantization
+FARTHEST = 10.0  # and its depth_max, in the unit of the depth
+
+
+def encode_compressed_depth(
+    depth: np.ndarray, valid: np.ndarray, encoding: str = "32FC1", farthest: float = FARTHEST
+) -> tuple[str, bytes]:
+    """H x W depth and validity -> `format` and `data` of a compressedDepth CompressedImage.
+
+    32FC1 becomes 16-bit inverse depth up to `farthest` (beyond it: invalid), with steps that grow
+    with the square of the depth; 16UC1 thousandths of the unit, without loss.
+    """
+    if encoding == "16UC1":
+        values = depth_fields(depth, valid, encoding)["data"].view("<u2").reshape(depth.shape)
+        a = b = 0.0
+    else:
+        a = INVERSE_RESOLUTION * (INVERSE_RESOLUTION + 1.0)
+        b = 1.0 - a / farthest
+        # Nearer than this the 16 bits overflow.
+        inside = valid & (depth < farthest) & (depth > a / (65535 - b))
+        values = np.where(inside, a / np.where(inside, depth, 1.0) + b, 0).astype(np.uint16)
+    ok, data = cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise MessageError(f"a depth image of {depth.shape} could not be compressed")
+    return f"{encoding}; compressedDepth png", _HEADER.pack(0, a, b) + data.tobytes()
 
 
 def _png16(layout: str, data: bytes) -> np.ndarray:

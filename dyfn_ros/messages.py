@@ -10,7 +10,6 @@ import array
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
 from dyfn_ros.encodings import MessageError, Raster, decode_colour, decode_metric_depth
@@ -22,8 +21,9 @@ __all__ = [
     "camera_info_message",
     "cloud_message",
     "cloud_points",
+    "colour_message",
+    "compressed_message",
     "decode_camera_info",
-    "decode_compressed",
     "decode_depth",
     "decode_image",
     "depth_fields",
@@ -43,9 +43,6 @@ CLOUD_DTYPE = np.dtype(
     }
 )
 _FLOAT32 = 7  # sensor_msgs/PointField
-
-_JPEG = b"\xff\xd8\xff"
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def _raster(message: Any) -> Raster:
@@ -72,39 +69,6 @@ def decode_image(message: Any) -> np.ndarray:
 def decode_depth(message: Any) -> np.ndarray:
     """sensor_msgs/Image with depth -> H x W float32 metres, NaN invalid. Raises MessageError."""
     return decode_metric_depth(_raster(message))
-
-
-def decode_compressed(message: Any) -> np.ndarray:
-    """sensor_msgs/CompressedImage with JPEG or PNG -> H x W x 3 uint8 RGB.
-
-    What the data is decides, not what `format` says: drivers write many things there.
-    Raises MessageError for other codecs, depth transports, and incomplete or broken files.
-    """
-    data = _bytes(message.data)
-    _check_complete(data.tobytes(), str(message.format))
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise MessageError(f"the compressed image cannot be decoded: {error}") from error
-    if image is None or image.size == 0:
-        raise MessageError(f"the compressed image (format {message.format!r}) cannot be decoded")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _check_complete(data: bytes, name: str) -> None:
-    """Decoders fill what a cut-off file lacks with grey; that is no measurement."""
-    if "compressedDepth" in name:
-        raise MessageError(f"format {name!r} is a depth image; expected a JPEG or PNG colour image")
-    if data.startswith(_JPEG):
-        complete = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
-    elif data.startswith(_PNG):
-        complete = b"IEND" in data[-64:]
-    else:
-        raise MessageError(
-            f"the {len(data)} bytes (format {name!r}) are neither JPEG nor PNG, the known formats"
-        )
-    if not complete:
-        raise MessageError(f"the compressed image (format {name!r}) ends early: {len(data)} bytes")
 
 
 @dataclass(frozen=True)
@@ -175,21 +139,31 @@ def valid_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     return mask & np.isfinite(depth) & (depth > 0)
 
 
-def depth_fields(depth: np.ndarray, valid: np.ndarray) -> dict[str, Any]:
-    """H x W depth and validity -> the fields of a 32FC1 Image but the header; NaN invalid.
+def depth_fields(depth: np.ndarray, valid: np.ndarray, encoding: str = "32FC1") -> dict[str, Any]:
+    """H x W depth and validity -> the fields of an Image but the header.
 
-    `data` is a 1-D uint8 array.
+    encoding: 32FC1, NaN invalid; or 16UC1, thousandths of the unit, 0 invalid (also what is
+    nearer than half a thousandth or beyond 65.535). `data` is a 1-D uint8 array.
     """
-    values = np.where(valid, depth, np.nan).astype("<f4")
+    values = _thousandths(depth, valid) if encoding == "16UC1" else _floats(depth, valid)
     height, width = values.shape
     return {
         "height": height,
         "width": width,
-        "encoding": "32FC1",
+        "encoding": encoding,
         "is_bigendian": 0,
-        "step": 4 * width,
+        "step": values.itemsize * width,
         "data": values.reshape(-1).view(np.uint8),
     }
+
+
+def _floats(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return np.where(valid, depth, np.nan).astype("<f4")
+
+
+def _thousandths(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    rounded = np.rint(np.where(valid, depth, 0) * 1000.0)
+    return np.where(rounded <= 65535, rounded, 0).astype("<u2")
 
 
 def pack_cloud(points: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
@@ -229,14 +203,35 @@ def _ros_bytes(values: np.ndarray) -> array.array:
     return data
 
 
-def depth_message(header: Any, depth: np.ndarray, valid: np.ndarray) -> Any:
-    """-> sensor_msgs.msg.Image, 32FC1; header as it is."""
+def depth_message(
+    header: Any, depth: np.ndarray, valid: np.ndarray, encoding: str = "32FC1"
+) -> Any:
+    """-> sensor_msgs.msg.Image, see depth_fields; header as it is."""
+    return _image(header, depth_fields(depth, valid, encoding))
+
+
+def colour_message(header: Any, rgb: np.ndarray) -> Any:
+    """H x W x 3 uint8 RGB -> sensor_msgs.msg.Image, rgb8; header as it is."""
+    height, width = rgb.shape[:2]
+    fields = {"height": height, "width": width, "encoding": "rgb8", "step": 3 * width}
+    return _image(header, {**fields, "data": rgb})
+
+
+def _image(header: Any, fields: dict[str, Any]) -> Any:
     from sensor_msgs.msg import Image
 
-    fields = depth_fields(depth, valid)
     message = Image(header=header)
     for name, value in fields.items():
         setattr(message, name, _ros_bytes(value) if name == "data" else value)
+    return message
+
+
+def compressed_message(header: Any, layout: str, data: bytes) -> Any:
+    """-> sensor_msgs.msg.CompressedImage; layout is its `format`."""
+    from sensor_msgs.msg import CompressedImage
+
+    message = CompressedImage(header=header, format=layout)
+    message.data = _ros_bytes(np.frombuffer(data, np.uint8))
     return message
 
 

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
+from dyfn_core.geometry.edges import flying_pixels
 from dyfn_ros import messages
 from dyfn_ros.camera_stream import Geometry
+from dyfn_ros.compressed_depth import FARTHEST, encode_compressed_depth
 from dyfn_ros.parameter_table import Settings
 from dyfn_ros.ports import Ports
 
@@ -23,7 +25,7 @@ _RESETS_DEPTH = 10
 class Outputs:
     """The topics `~/depth/...`, `~/points` and `~/resets` of one camera.
 
-    prefix: "" or "CAMERA/", before each of these names.
+    prefix: "" or "CAMERA/", before each of these names. The inference thread publishes.
     """
 
     def __init__(self, ports: Ports, prefix: str, lossless: bool) -> None:
@@ -34,10 +36,17 @@ class Outputs:
             history=HistoryPolicy.KEEP_LAST,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
-        self._depth = ports.publisher(Image, f"~/{prefix}depth/image", qos)
-        self._info = ports.publisher(CameraInfo, f"~/{prefix}depth/camera_info", qos)
-        self._points = ports.publisher(PointCloud2, f"~/{prefix}points", qos)
+
+        def advertise(kind: type, topic: str) -> Any:
+            return ports.publisher(kind, f"~/{prefix}{topic}", qos)
+
+        self._depth = advertise(Image, "depth/image")
+        self._packed = advertise(CompressedImage, "depth/image/compressedDepth")
+        self._info = advertise(CameraInfo, "depth/camera_info")
+        self._colored = advertise(Image, "depth/colored")
+        self._points = advertise(PointCloud2, "points")
         self._resets = ports.publisher(DiagnosticArray, f"~/{prefix}resets", latched)
+        self._colours = ColourScale()
 
     def publish(
         self,
@@ -48,14 +57,24 @@ class Outputs:
         settings: Settings,
     ) -> None:
         """header: of the input, kept as it is. info: describes the image; None when unknown."""
-        valid = in_range(geometry.depth, geometry.valid, settings.min_depth, settings.max_depth)
+        depth, encoding = geometry.depth, settings.depth_encoding
+        valid = in_range(depth, geometry.valid, settings.min_depth, settings.max_depth)
         if settings.publish_depth:
             if self._depth.get_subscription_count():
-                self._depth.publish(messages.depth_message(header, geometry.depth, valid))
+                self._depth.publish(messages.depth_message(header, depth, valid, encoding))
+            if self._packed.get_subscription_count():
+                farthest = settings.max_depth or FARTHEST
+                packed = encode_compressed_depth(depth, valid, encoding, farthest)
+                self._packed.publish(messages.compressed_message(header, *packed))
             if self._info.get_subscription_count():
                 self._info.publish(_sibling_info(header, info, geometry))
+        if settings.publish_colored and self._colored.get_subscription_count():
+            if geometry.reset:
+                self._colours = ColourScale()
+            painted = self._colours.paint(np.where(valid, depth, np.nan))
+            self._colored.publish(messages.colour_message(header, painted))
         if settings.publish_points and self._points.get_subscription_count():
-            cloud = messages.pack_cloud(geometry.points, valid, image)
+            cloud = filtered_cloud(geometry, valid, image, settings)
             self._points.publish(messages.cloud_message(header, cloud))
 
     def publish_reset(self, header: Any, name: str, reason: str, counts: dict[str, int]) -> None:
@@ -65,6 +84,44 @@ class Outputs:
             level=DiagnosticStatus.OK, name=name, message=reason, values=values
         )
         self._resets.publish(DiagnosticArray(header=header, status=[status]))
+
+
+class ColourScale:
+    """Depth as colours whose scale follows the scene slowly, so that pictures do not flicker."""
+
+    def __init__(self, weight: float = 0.1) -> None:
+        """weight: of a new frame's range; the first frame's counts whole."""
+        self._weight = weight
+        self._range: np.ndarray | None = None
+
+    def paint(self, depth: np.ndarray) -> np.ndarray:
+        """H x W depth, NaN invalid -> H x W x 3 uint8 RGB, see colour_depth."""
+        from dyfn_core.evaluation.pictures import colour_depth, depth_range  # imports matplotlib
+
+        sample = depth[::4, ::4]
+        if np.isfinite(sample).any():
+            now = np.log(depth_range([sample]))
+            before = now if self._range is None else self._range
+            self._range = before + self._weight * (now - before)
+        near, far = (1.0, 2.0) if self._range is None else np.exp(self._range)
+        return colour_depth(depth, float(near), float(far))
+
+
+def filtered_cloud(
+    geometry: Geometry, valid: np.ndarray, image: np.ndarray, settings: Settings
+) -> np.ndarray:
+    """The cloud that the points_... settings ask for: h x w of messages.CLOUD_DTYPE.
+
+    Range and edges are judged at full resolution; the stride then takes the middle pixel of each
+    block.
+    """
+    valid = in_range(geometry.depth, valid, settings.points_min_depth, settings.points_max_depth)
+    if settings.points_edge_filter:
+        valid &= ~flying_pixels(geometry.depth, valid, settings.points_edge_filter)
+    stride = settings.points_stride
+    first = (min(stride, *valid.shape) - 1) // 2
+    grid = (slice(first, None, stride),) * 2
+    return messages.pack_cloud(geometry.points[grid], valid[grid], image[grid])
 
 
 def in_range(depth: np.ndarray, valid: np.ndarray, near: float, far: float) -> np.ndarray:

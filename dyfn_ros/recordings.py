@@ -10,9 +10,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dyfn_ros.calibration import CalibrationRules, Calibrator, undistort_depth
 from dyfn_ros.compressed_depth import decode_compressed_depth
+from dyfn_ros.compressed_image import decode_compressed
 from dyfn_ros.encodings import MessageError
-from dyfn_ros.messages import decode_camera_info, decode_compressed, decode_depth, decode_image
+from dyfn_ros.messages import decode_depth, decode_image
 from dyfn_ros.recording_writer import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -48,9 +50,10 @@ class RecordedFrame:
 
     index: 0, 1, 2 ... over the frames that could be read.
     stamp_ns: the header's stamp. frame_id: the header's.
-    image: H x W x 3 uint8 RGB.
+    image: H x W x 3 uint8 RGB, lens distortion undone (and that of depth), as the node does.
     camera_matrix: 3 x 3 float64 in pixels; None without usable calibration.
     depth: H' x W' float32 metres, NaN invalid; None without ground truth for this stamp.
+    visible: H x W bool, where undistortion found a picture; None: everywhere.
     source, info: the image and the latest CameraInfo as recorded (or made, for an RGB-D folder).
     """
 
@@ -62,6 +65,7 @@ class RecordedFrame:
     depth: np.ndarray | None
     source: Recorded
     info: Recorded | None
+    visible: np.ndarray | None = None
 
 
 @dataclass
@@ -119,6 +123,7 @@ class RosRecording:
         self.path = path
         self.topics = topics
         self.notes = Notes()
+        self._rules = CalibrationRules()
         self._storage = storage
         self._tolerance_ns = round(tolerance * 1e9)
 
@@ -130,11 +135,12 @@ class RosRecording:
     def frames(self) -> Iterator[RecordedFrame]:
         """See Recording."""
         self.notes = Notes()
-        calibration = _Calibration(self._first_info(), self.notes)
+        infos = _Infos(self._first_info())
+        calibrator = Calibrator(self._unusable)
         index = 0
         for image, depth in self._pairs():
-            calibration.info = image.info or calibration.info
-            frame = self._decode(index, image, depth, calibration)
+            infos.recorded = image.info or infos.recorded
+            frame = self._decode(index, image, depth, infos, calibrator)
             if frame is not None:
                 index += 1
                 yield frame
@@ -170,25 +176,38 @@ class RosRecording:
         stamp = message.header.stamp
         return _Stamped(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded)
 
+    def _unusable(self, reason: str) -> None:
+        """Noted once, however many frames it is in force for."""
+        self.notes.warnings[f"{self.topics.camera_info}: {reason}"] = 1
+
     def _decode(
-        self, index: int, image: _Stamped, depth: _Stamped | None, calibration: _Calibration
+        self,
+        index: int,
+        image: _Stamped,
+        depth: _Stamped | None,
+        infos: _Infos,
+        calibrator: Calibrator,
     ) -> RecordedFrame | None:
         message = image.recorded.message()
+        frame_id = str(message.header.frame_id)
         compressed = image.recorded.kind == COMPRESSED_IMAGE
         try:
             pixels = decode_compressed(message) if compressed else decode_image(message)
+            view = calibrator.view(pixels, frame_id, infos.message(), self._rules)
         except MessageError as error:
             self.notes.losses[f"{image.recorded.topic}: image skipped: {error}"] += 1
             return None
+        truth = self._decode_depth(depth)
         return RecordedFrame(
             index=index,
             stamp_ns=image.stamp_ns,
-            frame_id=str(message.header.frame_id),
-            image=pixels,
-            camera_matrix=calibration.matrix(pixels.shape[0], pixels.shape[1]),
-            depth=self._decode_depth(depth),
+            frame_id=frame_id,
+            image=view.image,
+            camera_matrix=view.matrix,
+            depth=None if truth is None else undistort_depth(truth, view),
             source=image.recorded,
-            info=calibration.info,
+            info=infos.recorded,
+            visible=view.visible,
         )
 
     def _decode_depth(self, depth: _Stamped | None) -> np.ndarray | None:
@@ -212,32 +231,24 @@ class _Stamped:
     info: Recorded | None = None
 
 
-class _Calibration:
-    """The camera matrix that is in force, decoded once per CameraInfo content and image size."""
+class _Infos:
+    """The CameraInfo in force, deserialised once per content."""
 
-    def __init__(self, first: Recorded | None, notes: Notes) -> None:
-        self.info = first
-        self._notes = notes
-        self._known: tuple[Any, np.ndarray | None] | None = None
+    def __init__(self, first: Recorded | None) -> None:
+        self.recorded = first
+        self._known: tuple[bytes, Any] | None = None
 
-    def matrix(self, height: int, width: int) -> np.ndarray | None:
-        """3 x 3 in pixels of a height x width image; None, with a warning, if unusable."""
-        if self.info is None:
+    def message(self) -> Any:
+        """None without one, or with one that cannot be read."""
+        if self.recorded is None:
             return None
-        key = (self.info.data[12:], height, width)  # all but the CDR head and the stamp
-        if self._known is None or self._known[0] != key:
-            self._known = (key, self._decode(self.info, height, width))
+        content = self.recorded.data[12:]  # all but the CDR head and the stamp
+        if self._known is None or self._known[0] != content:
+            try:
+                self._known = (content, self.recorded.message())
+            except RecordingError:  # counted where it was read
+                self._known = (content, None)
         return self._known[1]
-
-    def _decode(self, info: Recorded, height: int, width: int) -> np.ndarray | None:
-        try:
-            calibration = decode_camera_info(info.message(), height, width)
-        except (MessageError, RecordingError) as error:
-            self._notes.warnings[f"{info.topic}: not used: {error}"] += 1
-            return None
-        if calibration.distorted:
-            self._notes.warnings[f"{info.topic}: lens distortion is ignored"] += 1
-        return calibration.matrix
 
 
 def match_depth(

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
 from dyfn_ros import messages
+from dyfn_ros.compressed_image import Layout, decode_compressed, parse_format
 from dyfn_ros.messages import MessageError
 
 K = [100.0, 0.0, 63.5, 0.0, 110.0, 47.5, 0.0, 0.0, 1.0]
@@ -86,14 +87,14 @@ def test_module_needs_no_ros() -> None:
 def test_png_gives_its_pixels_whatever_format_says(name: str) -> None:
     rgb = picture()
     data = encoded(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    assert np.array_equal(messages.decode_compressed(compressed(data, name)), rgb)
+    assert np.array_equal(decode_compressed(compressed(data, name)), rgb)
 
 
 @pytest.mark.parametrize("name", ["jpeg", "rgb8; jpeg compressed bgr8", "jpg"])
 def test_jpeg_gives_its_colours_in_rgb_order(name: str) -> None:
     rgb = picture()
     data = encoded(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    got = messages.decode_compressed(compressed(data, name)).astype(int)
+    got = decode_compressed(compressed(data, name)).astype(int)
     assert np.abs(got - rgb).max() <= 8
 
 
@@ -103,9 +104,47 @@ def test_jpeg_gives_its_colours_in_rgb_order(name: str) -> None:
 def test_grey_files_become_rgb(suffix: str, dtype: type) -> None:
     level = 120 if dtype is np.uint8 else 120 * 257
     data = encoded(suffix, np.full((8, 6), level, dtype))
-    got = messages.decode_compressed(compressed(data, "mono8; x compressed"))
+    got = decode_compressed(compressed(data, "mono8; x compressed"))
     assert got.shape == (8, 6, 3)
     assert np.abs(got.astype(int) - 120).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("text", "layout"),
+    [
+        ("jpeg", Layout(codec="jpeg")),
+        ("rgb8; jpeg compressed bgr8", Layout("rgb8", "jpeg", "bgr8")),
+        ("bayer_rggb8; png compressed ", Layout("bayer_rggb8", "png", "")),
+        (" mono8 ;jpg", Layout("mono8", "jpg", "")),
+        ("", Layout()),
+        (";;", Layout()),
+    ],
+)
+def test_the_format_says_what_was_compressed(text: str, layout: Layout) -> None:
+    assert parse_format(text) == layout
+
+
+def test_a_codec_that_was_given_rgb_gives_rgb_back() -> None:
+    rgb = picture()
+    data = encoded(".png", rgb)  # OpenCV takes it for BGR, as the publisher's codec did
+    assert np.array_equal(decode_compressed(compressed(data, "rgb8; png compressed rgb8")), rgb)
+
+
+@pytest.mark.parametrize(("bits", "factor"), [(8, 1), (16, 257)])
+def test_a_compressed_bayer_mosaic_is_demosaiced(bits: int, factor: int) -> None:
+    mosaic = np.empty((6, 8), np.uint8 if bits == 8 else np.uint16)
+    for i, value in enumerate((200, 100, 100, 50)):  # rggb
+        mosaic[i // 2 :: 2, i % 2 :: 2] = value * factor
+    message = compressed(encoded(".png", mosaic), f"bayer_rggb{bits}; png compressed ")
+    assert (decode_compressed(message) == (200, 100, 50)).all()
+    demosaiced = compressed(encoded(".png", picture()), "bayer_rggb8; png compressed bgr8")
+    assert np.array_equal(decode_compressed(demosaiced), picture()[..., ::-1])
+
+
+@pytest.mark.parametrize("name", ["bayer_rggb16; png compressed ", "bayer_xyz8; png compressed"])
+def test_a_file_that_is_no_such_mosaic_is_refused(name: str) -> None:
+    with pytest.raises(MessageError, match="needs a grey picture"):
+        decode_compressed(compressed(encoded(".png", np.zeros((6, 8), np.uint8)), name))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
@@ -113,7 +152,7 @@ def test_grey_files_become_rgb(suffix: str, dtype: type) -> None:
 def test_cut_off_files_are_refused(suffix: str, share: float) -> None:
     data = encoded(suffix, np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8))
     with pytest.raises(MessageError, match="ends early"):
-        messages.decode_compressed(compressed(data[: int(share * len(data))], "jpeg"))
+        decode_compressed(compressed(data[: int(share * len(data))], "jpeg"))
 
 
 @pytest.mark.parametrize(
@@ -129,14 +168,14 @@ def test_cut_off_files_are_refused(suffix: str, share: float) -> None:
 )
 def test_what_is_no_picture_is_refused(data: bytes, name: str, match: str) -> None:
     with pytest.raises(MessageError, match=match):
-        messages.decode_compressed(compressed(data, name))
+        decode_compressed(compressed(data, name))
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200), st.sampled_from([b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"]))
 def test_any_bytes_are_a_picture_or_refused(tail: bytes, start: bytes) -> None:
     try:
-        image = messages.decode_compressed(compressed(start + tail, "jpeg"))
+        image = decode_compressed(compressed(start + tail, "jpeg"))
     except MessageError:
         return
     assert image.ndim == 3
@@ -160,7 +199,15 @@ def test_rectified_images_take_p() -> None:
 def test_ros1_field_names_are_read_too() -> None:
     roi = SimpleNamespace(x_offset=0, y_offset=0, height=0, width=0)
     old = SimpleNamespace(
-        K=K, P=[0] * 12, D=[], height=96, width=128, roi=roi, binning_x=0, binning_y=0
+        K=K,
+        P=[0] * 12,
+        D=[],
+        distortion_model="",
+        height=96,
+        width=128,
+        roi=roi,
+        binning_x=0,
+        binning_y=0,
     )
     assert messages.decode_camera_info(old, 96, 128).matrix[0, 0] == 100
 

@@ -1,0 +1,103 @@
+"""Colour images inside sensor_msgs/CompressedImage: JPEG and PNG, whatever `format` says."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dyfn_ros.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
+
+_JPEG = b"\xff\xd8\xff"
+_PNG = b"\x89PNG\r\n\x1a\n"
+_LAYOUT = re.compile(
+    r"^\s*(?:(?P<encoding>\w+)\s*;\s*)?(?P<codec>\w+)(?:\s+compressed\s*(?P<order>\w*))?"
+)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What `format` says: "rgb8; jpeg compressed bgr8", or just "jpeg".
+
+    encoding: of the image before compression. order: of the channels that the codec was given.
+    Empty where it says nothing.
+    """
+
+    encoding: str = ""
+    codec: str = ""
+    order: str = ""
+
+
+def parse_format(text: str) -> Layout:
+    """Anything is accepted: drivers write many things there."""
+    match = _LAYOUT.match(text)
+    return (
+        Layout(**{key: value or "" for key, value in match.groupdict().items()})
+        if match
+        else Layout()
+    )
+
+
+def decode_compressed(message: Any) -> np.ndarray:
+    """sensor_msgs/CompressedImage with JPEG or PNG -> H x W x 3 uint8 RGB.
+
+    What the data is decides on the codec. `format` decides on what a file cannot say: whether a
+    grey one is a Bayer mosaic, and whether the codec was given RGB where files have BGR.
+    Raises MessageError for other codecs, depth transports, and incomplete or broken files.
+    """
+    data, text = np.frombuffer(message.data, np.uint8), str(message.format)
+    _check_complete(data.tobytes(), text)
+    layout = parse_format(text)
+    mosaic = layout.encoding.startswith("bayer_") and layout.order in ("", layout.encoding)
+    try:
+        kind = cv2.IMREAD_UNCHANGED if mosaic else cv2.IMREAD_COLOR
+        image = cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise MessageError(f"the compressed image cannot be decoded: {error}") from error
+    if image is None or image.size == 0:
+        raise MessageError(f"the compressed image (format {text!r}) cannot be decoded")
+    if mosaic:
+        return _demosaiced(image, layout, text)
+    # What the codec was given as RGB comes back as RGB, in the places of BGR.
+    if layout.order.startswith("rgb"):
+        return np.ascontiguousarray(image)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _demosaiced(image: np.ndarray, layout: Layout, text: str) -> np.ndarray:
+    bits = 8 * image.itemsize
+    if (
+        image.ndim != 2
+        or layout.encoding not in COLOUR_ENCODINGS
+        or f"{bits}" != layout.encoding[10:]
+    ):
+        raise MessageError(
+            f"format {text!r} needs a grey picture of its depth, the file has shape {image.shape} "
+            f"of {image.dtype}"
+        )
+    height, width = image.shape
+    rows = np.ascontiguousarray(image.astype(image.dtype.newbyteorder("<"), copy=False))
+    return decode_colour(
+        Raster(
+            rows.reshape(-1).view(np.uint8), height, width, layout.encoding, width * image.itemsize
+        )
+    )
+
+
+def _check_complete(data: bytes, name: str) -> None:
+    """Decoders fill what a cut-off file lacks with grey; that is no measurement."""
+    if "compressedDepth" in name:
+        raise MessageError(f"format {name!r} is a depth image; expected a JPEG or PNG colour image")
+    if data.startswith(_JPEG):
+        complete = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    elif data.startswith(_PNG):
+        complete = b"IEND" in data[-64:]
+    else:
+        raise MessageError(
+            f"the {len(data)} bytes (format {name!r}) are neither JPEG nor PNG, the known formats"
+        )
+    if not complete:
+        raise MessageError(f"the compressed image (format {name!r}) ends early: {len(data)} bytes")

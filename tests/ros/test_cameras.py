@@ -1,0 +1,366 @@
+"""Two cameras in one node: own streams, own topics, one batch; resets and diagnostics of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from diagnostic_msgs.msg import DiagnosticArray
+from probe import Probe, stamp_of, stamped, statuses
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from ros_graph import (
+    NODE,
+    NodeProcess,
+    camera_info,
+    frames,
+    image_message,
+    own_domain,
+    tiny_node,
+)
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from tiny_model import FAILING, load_tiny
+
+from dyfn_core.geometry.edges import flying_pixels
+from dyfn_core.stream import DepthStream
+from dyfn_ros import messages
+from dyfn_ros.compressed_depth import decode_compressed_depth
+
+BOTH = ("front", "left")
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Rig:
+    """The node with two cameras, and the time of the images that were sent to it."""
+
+    def __init__(self, node: NodeProcess, probe: Probe) -> None:
+        self.node, self.probe = node, probe
+        self.now = 100.0
+        self._count = 0
+        for camera in BOTH:
+            probe.listen(f"{camera}/depth/image", Image)
+            probe.listen(f"{camera}/resets", DiagnosticArray, LATCHED)
+        probe.listen("/diagnostics", DiagnosticArray)
+
+    def send(self, camera: str, rgb: np.ndarray, step: float = 0.1, **header: Any) -> int:
+        """-> the stamp in nanoseconds, which no other image has, also when time goes back."""
+        self.now += step
+        self._count += 1
+        stamp = round(self.now * 1e6) * 1000 + self._count % 1000
+        self.probe.publish(f"/{camera}/image", stamped(image_message(rgb), stamp, **header))
+        return stamp
+
+    def depth(self, camera: str, stamp: int) -> bytes:
+        """The depth image of a frame that was sent."""
+        return bytes(self.message(f"{camera}/depth/image", stamp).data)
+
+    def message(self, topic: str, stamp: int) -> Any:
+        def found() -> Any:
+            return next((m for m in self.probe.received[topic] if stamp_of(m) == stamp), None)
+
+        return self.probe.wait(found)
+
+    def play(self, camera: str, images: list[np.ndarray], **header: Any) -> list[bytes]:
+        stamps = [self.send(camera, image, **header) for image in images]
+        return [self.depth(camera, stamp) for stamp in stamps]
+
+    def reset(self) -> None:
+        assert self.probe.trigger("reset").success
+
+    def reset_at(self, camera: str, stamp: int) -> tuple[str, dict[str, str]]:
+        """Reason, and counts by reason, of the reset with this frame."""
+        status = self.message(f"{camera}/resets", stamp).status[0]
+        return status.message, {v.key: v.value for v in status.values}
+
+    def diagnostics(self) -> dict[str, tuple[str, dict[str, str]]]:
+        """The next that comes."""
+        known = self.probe.received["/diagnostics"]
+        count = len(known)
+        self.probe.wait(lambda: len(known) > count)
+        return statuses(known[-1])
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    parameters = {
+        "cameras": "[front, left]",
+        "drop_frames": False,
+        "diagnostics_period": 0.1,
+        "left.max_gap": 50.0,
+    }
+    with own_domain() as environment:
+        node = tiny_node(environment, tmp_path_factory.mktemp("node"), **parameters)
+        probe = Probe(environment)
+        rig = Rig(node, probe)
+        for camera in BOTH:
+            while not probe.received[f"{camera}/depth/image"]:
+                rig.send(camera, frames(1)[0])
+                probe.executor.spin_once(timeout_sec=0.05)
+            rig.play(camera, frames(1))
+        yield rig
+        probe.close()
+        assert node.end() == 0, node.log
+
+
+@pytest.fixture
+def rig(both: Rig) -> Rig:
+    """Both streams start anew with the next frame."""
+    both.reset()
+    return both
+
+
+def alone(images: list[np.ndarray], matrix: np.ndarray | None = None) -> list[np.ndarray]:
+    """The depth that one stream gives in this process, NaN where it is not valid."""
+    stream = DepthStream(load_tiny(), camera_matrix=matrix)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    predictions = [stream.push(image) for image in images]
+    torch.set_num_threads(threads)
+    return [torch.where(p.mask, p.depth, torch.nan).numpy() for p in predictions]
+
+
+def as_depth(data: bytes, height: int = 36, width: int = 48) -> np.ndarray:
+    return np.frombuffer(data, "<f4").reshape(height, width)
+
+
+def test_each_camera_has_a_stream_of_its_own(rig: Rig) -> None:
+    """Interleaved or together, each gives what it would give alone."""
+    images = {camera: frames(4, seed=i) for i, camera in enumerate(BOTH)}
+    stamps = {camera: [] for camera in BOTH}
+    for index in range(4):
+        for camera in BOTH:
+            stamps[camera].append(rig.send(camera, images[camera][index]))
+    for camera in BOTH:
+        for stamp, expected in zip(stamps[camera], alone(images[camera]), strict=True):
+            got = as_depth(rig.depth(camera, stamp))
+            np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_without_batches_a_camera_gets_the_very_bytes_it_gets_alone(rig: Rig) -> None:
+    assert rig.probe.set("batch", False).successful
+    stamps = []
+    images = frames(3, seed=5)
+    for image in images:
+        stamps.append(rig.send("front", image))
+        rig.send("left", frames(1, seed=9)[0])
+    expected = [depth.tobytes() for depth in alone(images)]
+    assert [rig.depth("front", stamp) for stamp in stamps] == expected
+    assert rig.probe.set("batch", True).successful
+
+
+def test_a_camera_that_fails_or_is_bad_costs_the_other_nothing(rig: Rig) -> None:
+    rig.play("left", frames(1))
+    failing = frames(1)[0].copy()
+    failing[0, 0] = FAILING
+    good = frames(3, seed=4)
+    stamps = []
+    for image in good:
+        rig.send("left", failing)
+        stamps.append(rig.send("front", image))
+    for stamp, expected in zip(stamps, alone(good), strict=True):
+        np.testing.assert_allclose(as_depth(rig.depth("front", stamp)), expected, rtol=1e-5)
+    stamp = rig.send("left", frames(1)[0])
+    assert rig.reset_at("left", stamp)[0] == "inference failed"
+
+
+def test_one_camera_can_be_reset_alone(rig: Rig) -> None:
+    images = frames(2)
+    first = {camera: rig.play(camera, images) for camera in BOTH}
+    assert rig.probe.trigger("left/reset").success
+    again = {camera: rig.play(camera, images) for camera in BOTH}
+    assert again["left"] == first["left"]
+    assert again["front"] != first["front"]
+
+
+@pytest.mark.parametrize(
+    ("step", "header", "reason"),
+    [
+        (-1.0, {}, "stamp went back"),
+        (20.0, {}, "gap between stamps"),
+        (0.1, {"frame_id": "other"}, "frame_id changed"),
+    ],
+)
+def test_what_ends_the_past_is_published_with_its_reason_and_stamp(
+    rig: Rig, step: float, header: dict[str, str], reason: str
+) -> None:
+    first = rig.play("front", frames(2))
+    before = int(rig.diagnostics()["stream_depth: front"][1].get(f"resets: {reason}", 0))
+    stamp = rig.send("front", frames(2)[0], step, **header)
+    assert rig.depth("front", stamp) == first[0]
+    found, counts = rig.reset_at("front", stamp)
+    assert found == reason
+    assert int(counts[reason]) == before + 1
+    assert rig.diagnostics()["stream_depth: front"][1][f"resets: {reason}"] == counts[reason]
+    rig.play("front", frames(1))  # back to the usual frame_id
+
+
+def test_a_camera_may_have_a_value_of_its_own(rig: Rig) -> None:
+    """left.max_gap is 50 s, front has the node's 5 s."""
+    assert rig.probe.set("left.max_gap", 60.0).successful
+    assert not rig.probe.set("front.max_gap", 60.0).successful
+    for camera in BOTH:
+        rig.play(camera, frames(1))
+    rig.now += 20.0
+    stamps = {camera: rig.send(camera, frames(1)[0]) for camera in BOTH}
+    assert rig.reset_at("front", stamps["front"])[0] == "gap between stamps"
+    rig.depth("left", stamps["left"])
+    assert stamps["left"] not in map(stamp_of, rig.probe.received["left/resets"])
+
+
+def test_small_steps_back_are_no_reset(rig: Rig) -> None:
+    rig.play("front", frames(1))
+    stamps = [rig.send("front", frames(1)[0], step) for step in (-0.1, 0.2)]
+    for stamp in stamps:
+        rig.depth("front", stamp)
+    assert not set(stamps) & set(map(stamp_of, rig.probe.received["front/resets"]))
+
+
+def test_diagnostics_tell_the_state_of_the_node_and_of_each_camera(rig: Rig) -> None:
+    rig.play("front", frames(2))
+    found = rig.diagnostics()
+    assert list(found) == ["stream_depth", "stream_depth: front", "stream_depth: left"]
+    values = found["stream_depth"][1]
+    assert (values["model"], values["state"], values["device"]) == ("tiny", "active", "cpu")
+    front = found["stream_depth: front"][1]
+    assert front["image topic"] == "/front/image"
+    assert int(front["published"]) >= 2
+    assert front["processing p50"].endswith(" ms")
+    assert float(front["processing p99"].split()[0]) >= float(front["processing p50"].split()[0])
+    assert "not of this node's clock" in rig.diagnostics()["stream_depth: front"][0]
+
+
+def test_a_silent_camera_and_a_bad_image_are_problems_in_diagnostics(rig: Rig) -> None:
+    rig.probe.wait(lambda: "no images on /left/image" in rig.diagnostics()["stream_depth: left"][0])
+    rig.probe.publish("/left/image", stamped(image_message(frames(1)[0], "jello"), 1))
+    rig.probe.wait(lambda: "could not be used" in rig.diagnostics()["stream_depth: left"][0])
+
+
+def test_an_incompatible_subscriber_is_named_in_diagnostics(rig: Rig) -> None:
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    rig.probe.listen("left/points", PointCloud2, latched)
+    text = f"{NODE}/left/points: 1 x a subscriber with incompatible QoS (DURABILITY)"
+    rig.probe.wait(lambda: text in rig.diagnostics()["stream_depth"][0])
+
+
+def test_an_incompatible_publisher_is_named_in_diagnostics(rig: Rig) -> None:
+    unreliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    rig.probe.node.create_publisher(Image, "/left/image", unreliable)
+    text = "/left/image: 1 x a publisher with incompatible QoS (RELIABILITY)"
+    rig.probe.wait(lambda: text in rig.diagnostics()["stream_depth"][0])
+
+
+def test_sixteen_bits_are_thousandths_with_zero_for_none(rig: Rig) -> None:
+    expected = as_depth(rig.play("front", frames(1))[0])
+    assert rig.probe.set("depth_encoding", "16UC1").successful
+    rig.reset()
+    message = rig.message("front/depth/image", rig.send("front", frames(1)[0]))
+    assert rig.probe.set("depth_encoding", "32FC1").successful
+    assert (message.encoding, message.step) == ("16UC1", 96)
+    values = np.frombuffer(message.data, "<u2").reshape(36, 48)
+    assert np.array_equal(values == 0, np.isnan(expected) | (expected < 0.0005))
+    np.testing.assert_allclose(values[values > 0] / 1000, expected[values > 0], atol=0.00051)
+
+
+def test_colours_and_compressed_depth_show_the_depth(rig: Rig) -> None:
+    topics = {"front/depth/colored": Image, "front/depth/image/compressedDepth": CompressedImage}
+    for topic, kind in topics.items():
+        rig.probe.listen(topic, kind)
+    rig.probe.wait(
+        lambda: (rig.play("front", frames(1)), all(rig.probe.received[t] for t in topics))[1]
+    )
+    stamp = rig.send("front", frames(1)[0])
+    depth = as_depth(rig.depth("front", stamp))
+    colored, packed = (rig.message(topic, stamp) for topic in topics)
+    assert (colored.encoding, colored.height, colored.width) == ("rgb8", 36, 48)
+    rgb = np.frombuffer(colored.data, np.uint8).reshape(36, 48, 3)
+    assert (rgb[np.isnan(depth)] == rgb[np.isnan(depth)][0]).all()
+    assert len(np.unique(rgb[~np.isnan(depth)], axis=0)) > 10
+    assert packed.format == "32FC1; compressedDepth png"
+    unpacked = decode_compressed_depth(packed)
+    inside = ~np.isnan(unpacked)
+    assert inside.mean() > 0.3
+    assert np.isnan(unpacked[np.isnan(depth)]).all()
+    np.testing.assert_allclose(unpacked[inside], depth[inside], rtol=0.02)
+
+
+def test_cloud_filters_thin_crop_and_cut_edges(rig: Rig) -> None:
+    rig.probe.listen("front/points", PointCloud2)
+    rig.probe.wait(lambda: (rig.play("front", frames(1)), rig.probe.received["front/points"])[1])
+    rig.reset()
+    depth = as_depth(rig.play("front", frames(1))[0])
+    near, far = (float(x) for x in np.nanquantile(depth, [0.1, 0.9]))
+    wanted = {
+        "points_stride": 3,
+        "points_min_depth": near,
+        "points_max_depth": far,
+        "points_edge_filter": 0.1,
+    }
+    for name in sorted(wanted, reverse=True):
+        assert rig.probe.set(name, wanted[name]).successful
+    rig.reset()
+    stamp = rig.send("front", frames(1)[0])
+    cloud = messages.cloud_points(rig.message("front/points", stamp))
+    assert np.array_equal(as_depth(rig.depth("front", stamp)), depth, equal_nan=True)
+    for name in ("points_min_depth", "points_max_depth", "points_edge_filter"):
+        assert rig.probe.set(name, 0.0).successful
+    assert rig.probe.set("points_stride", 1).successful
+    keep = (depth >= near) & (depth <= far)
+    cut = flying_pixels(depth, keep, 0.1)
+    assert 0 < cut.sum() < keep.sum()
+    expected = np.where(keep & ~cut, depth, np.nan)[1::3, 1::3]
+    assert cloud.shape == (12, 16)
+    assert np.array_equal(cloud["z"], expected, equal_nan=True)
+
+
+def test_a_distorted_lens_is_undone_or_refused(rig: Rig) -> None:
+    info = camera_info()
+    info.d = [-0.2, 0.05, 0.0, 0.0, 0.0]
+    rig.probe.listen("front/depth/camera_info", CameraInfo)
+    rig.probe.publish("/front/camera_info", stamped(info, 1))
+    matrix = np.reshape(info.k, (3, 3))
+
+    def in_force() -> bool:
+        stamp = rig.send("front", frames(1)[0])
+        got = rig.message("front/depth/camera_info", stamp)
+        return np.array_equal(np.reshape(got.k, (3, 3)), matrix) and not any(got.d)
+
+    rig.play("front", frames(1))
+    rig.probe.wait(in_force)
+    rig.reset()
+    image = frames(1)[0]
+    got = as_depth(rig.play("front", [image])[0])
+    from dyfn_ros.calibration import CalibrationRules, Calibrator
+
+    view = Calibrator(print).view(image, "optical", info, CalibrationRules())
+    assert view.visible is not None
+    expected = np.where(view.visible, alone([view.image], matrix)[0], np.nan)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+    assert rig.probe.set("distortion", "refuse").successful
+    rig.send("front", image)
+    rig.node.wait_log(r"WARN\].*/front/image: the lens is distorted .*refuse")
+    assert rig.probe.set("distortion", "ignore").successful
+    rig.reset()
+    got = as_depth(rig.play("front", [image])[0])
+    np.testing.assert_allclose(got, alone([image], matrix)[0], rtol=1e-5)
+    assert rig.probe.set("distortion", "undistort").successful
+
+
+def test_a_camera_info_of_another_frame_is_not_used(rig: Rig) -> None:
+    rig.probe.publish("/left/camera_info", stamped(camera_info(), 1, frame_id="elsewhere"))
+    reason = "frame_id is 'elsewhere', but the images have 'optical'"
+
+    def warned() -> bool:
+        rig.play("left", frames(1))
+        return reason in rig.node.log
+
+    rig.probe.wait(warned)
+    rig.reset()
+    expected = alone(frames(1))[0]
+    np.testing.assert_allclose(as_depth(rig.play("left", frames(1))[0]), expected, rtol=1e-5)
