@@ -48,6 +48,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/config", files("config")),
+        (f"{SHARE}/config/cameras", files("config/cameras")),
         (f"{SHARE}/launch", files("launch")),
     ],
     python_requires=">=3.10",

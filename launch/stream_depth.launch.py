@@ -1,19 +1,26 @@
-"""ros2 launch dyfn_ros stream_depth.launch.py image:=/camera/image_raw
+"""ros2 launch dyfn_ros stream_depth.launch.py image:=/camera/image_raw [rviz:=true]
 
-For an installation with ROS launch; without it, run `stream_depth --ros-args -r image:=...`.
+One camera; may be included by other launch files. For an installation with ROS launch; without
+it, run `stream_depth --ros-args -r image:=...`.
 """
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+CONFIG = PathJoinSubstitution([FindPackageShare("dyfn_ros"), "config"])
 ARGUMENTS = {
     "image": ("image", "Topic of the colour images; the compressed one is beside it."),
     "camera_info": ("camera_info", "Topic of their CameraInfo."),
     "namespace": ("", "Namespace of the node."),
     "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
+    "autostart": ("true", "Configure and activate at start; false: leave it to a manager."),
+    "use_sim_time": ("false", "Take the time from /clock."),
+    "rviz": ("false", "Start RViz with image, depth and cloud."),
 }
 
 
@@ -24,22 +31,30 @@ def generate_launch_description() -> LaunchDescription:
     ]
     params_file = DeclareLaunchArgument(
         "params_file",
-        default_value=PathJoinSubstitution(
-            [FindPackageShare("dyfn_ros"), "config", "stream_depth.yaml"]
-        ),
-        description="Parameter file of the node.",
+        default_value=PathJoinSubstitution([CONFIG, "stream_depth.yaml"]),
+        description="Parameter file of the node; config/cameras has some for usual cameras.",
     )
     image = LaunchConfiguration("image")
+    flags = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=bool)
+        for name in ("autostart", "use_sim_time")
+    }
     node = Node(
         package="dyfn_ros",
         executable="stream_depth",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params_file"), {"model": LaunchConfiguration("model")}],
-        remappings=[
-            ("image", image),
-            ("image/compressed", [image, "/compressed"]),
-            ("camera_info", LaunchConfiguration("camera_info")),
+        parameters=[
+            LaunchConfiguration("params_file"),
+            {"model": LaunchConfiguration("model"), **flags},
         ],
+        remappings=[("image", image), ("camera_info", LaunchConfiguration("camera_info"))],
         output="screen",
     )
-    return LaunchDescription([*declared, params_file, node])
+    rviz = Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", PathJoinSubstitution([CONFIG, "stream_depth.rviz"])],
+        remappings=[("/image", image)],
+        condition=IfCondition(LaunchConfiguration("rviz")),
+    )
+    return LaunchDescription([*declared, params_file, node, rviz])

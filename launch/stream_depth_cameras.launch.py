@@ -1,0 +1,47 @@
+"""ros2 launch dyfn_ros stream_depth_cameras.launch.py cameras:='[front, left]'
+
+Several cameras in one process. Each must publish `/CAMERA/image_raw` and `/CAMERA/camera_info`;
+other names are given by `image` and `camera_info`, below the camera's name.
+"""
+
+import yaml
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS = {
+    "cameras": ("[front, left]", "Names of the cameras, as a YAML list."),
+    "image": ("image_raw", "Their images, below /CAMERA/."),
+    "camera_info": ("camera_info", "Their CameraInfos, below /CAMERA/."),
+    "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
+    "params_file": ("", "Parameter file of the node, such as config/cameras/two_cameras.yaml."),
+}
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    cameras = [str(name) for name in yaml.safe_load(values["cameras"])]
+    files = [values["params_file"]] if values["params_file"] else []
+    remappings = [
+        (f"{camera}/{ours}", f"/{camera}/{values[theirs]}")
+        for camera in cameras
+        for ours, theirs in (("image", "image"), ("camera_info", "camera_info"))
+    ]
+    return [
+        Node(
+            package="dyfn_ros",
+            executable="stream_depth",
+            parameters=[*files, {"cameras": cameras, "model": values["model"]}],
+            remappings=remappings,
+            output="screen",
+        )
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=nodes)])
