@@ -75,11 +75,13 @@ class GeometryModel(nn.Module, ABC):
     mask_threshold: a pixel is valid where the raw mask exceeds it.
     quantity: "depth" (decode gives AffinePoints) or "disparity" (AffineDisparity).
     stabilizer_pool: the pooling that suits a new stabilizer on this latent.
+    token_cell: pixels along the side of one token of num_tokens.
     """
 
     mask_threshold: float = 0.5
     quantity: str = DEPTH
     stabilizer_pool: int = 1
+    token_cell: int = 14
     # No class-level None here: it would hide the registered submodule.
     stabilizer: Stabilizer | None
 

@@ -129,7 +129,7 @@ class DepthAnythingModel(GeometryModel):
     def decode(self, latent: Latent) -> AffineDisparity:
         """Latent -> disparity at the image's size."""
         disparity = self.depth_head(latent.features, latent.network_size)
-        return AffineDisparity(resized(disparity, latent.image_size)[:, 0])
+        return AffineDisparity(resized(disparity, latent.image_size)[:, 0].float())
 
 
 def official_encoder(weights: dict[str, Tensor]) -> str:

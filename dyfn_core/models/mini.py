@@ -166,6 +166,7 @@ class MiniModel(GeometryModel):
     """The small model; `config` rebuilds it, `stabilizer` is DyFN or None."""
 
     mask_threshold = 0.5
+    token_cell = CELL
 
     def __init__(self, config: MiniConfig | None = None) -> None:
         super().__init__()
@@ -244,7 +245,7 @@ class MiniModel(GeometryModel):
         points, mask = self.decode_raw(latent)
         points = _resize(points, latent.image_size)
         mask = _resize(mask[:, None], latent.image_size)[:, 0]
-        return AffinePoints(remap_exp(points), mask)
+        return AffinePoints(remap_exp(points.float()), mask.float())
 
 
 def remap_exp(raw: Tensor) -> Tensor:
@@ -257,6 +258,8 @@ def remap_exp(raw: Tensor) -> Tensor:
 
 
 def _resize(x: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
+    if tuple(x.shape[-2:]) == tuple(size):
+        return x
     return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
 
 

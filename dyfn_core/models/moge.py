@@ -222,8 +222,8 @@ class MoGeModel(GeometryModel):
         points, mask = self.head(latent.features, latent.network_size)
         points = F.interpolate(points, latent.image_size, mode="bilinear", align_corners=False)
         mask = F.interpolate(mask, latent.image_size, mode="bilinear", align_corners=False)
-        points = remap_points(points.movedim(1, -1), self.architecture.remap_output)
-        return AffinePoints(points, mask[:, 0])
+        points = remap_points(points.movedim(1, -1).float(), self.architecture.remap_output)
+        return AffinePoints(points, mask[:, 0].float())
 
 
 def resized(size: tuple[int, int], num_tokens: int) -> tuple[int, int]:

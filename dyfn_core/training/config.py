@@ -21,6 +21,7 @@ from dyfn_core.data.datasets import AUTO, RENDERED, data_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
+from dyfn_core.losses.objective import Objective
 from dyfn_core.models.mini import MiniConfig
 from dyfn_core.models.stabilizer import StabilizerConfig
 from dyfn_core.training.config_errors import check_fields, describe
@@ -175,15 +176,19 @@ class BaseRunConfig(RunConfig):
 class StabilizerRunConfig(RunConfig):
     """`dyfn-train stabilizer`: DyFN on a frozen base.
 
-    base: a checkpoint of type mini. stabilizer: fields of StabilizerConfig. warm_start: go on from
-    the base's own DyFN instead of a fresh one. cache: folder of
-    encoded clips (default: OUT/latents); cache_draws: batches of `stages[0].batch` clips in it, 0 for no
-    cache: every step then encodes clips of its own; cache_seed: of its draws (default: `seed`);
+    base: a checkpoint of any model. stabilizer: fields of StabilizerConfig. warm_start: go on from
+    the base's own DyFN instead of a fresh one. cache: folder of encoded clips (default:
+    OUT/latents); cache_draws: batches of `stages[0].batch` clips in it, 0 for no cache: every
+    step then encodes clips of its own; cache_seed: of its draws (default: `seed`);
     cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
     length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
     loss. The four weights: L_align from the first frame and from all, L_temp, and each frame's
     own error. align_differentiable: gradients flow through the first frame's alignment (the
-    paper detaches it). validation_stride: every so-many-th frame of the recording.
+    paper detaches it). A base of disparity is trained with L_ssi and L_temp as in the paper:
+    ssi_weight, temporal_weight, and disparity_align_weight for first-frame alignment in disparity
+    space. objective: fields of losses.objective.Objective; given, it replaces the terms above
+    for a base of points, and every unrolled frame is decoded. validation_stride: every
+    so-many-th frame of the recording.
     """
 
     base: Path
@@ -205,6 +210,9 @@ class StabilizerRunConfig(RunConfig):
     temporal_weight: float = Field(0.1, ge=0)
     frame_weight: float = Field(0.2, ge=0)
     spread_weight: float = Field(1.0, ge=0)
+    ssi_weight: float = Field(1.0, ge=0)
+    disparity_align_weight: float = Field(0.0, ge=0)
+    objective: dict[str, Any] | None = None
     validation_clips: int = Field(8, ge=1)
     validation_stride: int = Field(4, ge=1)
 
@@ -212,6 +220,11 @@ class StabilizerRunConfig(RunConfig):
     @classmethod
     def _describes_a_stabilizer(cls, value: dict[str, Any]) -> dict[str, Any]:
         return check_fields(value, StabilizerConfig)
+
+    @field_validator("objective")
+    @classmethod
+    def _describes_an_objective(cls, value: dict[str, Any] | None) -> dict[str, Any] | None:
+        return None if value is None else check_fields(value, Objective)
 
     @model_validator(mode="after")
     def _fits(self) -> StabilizerRunConfig:
@@ -231,6 +244,14 @@ class StabilizerRunConfig(RunConfig):
             "temporal": self.temporal_weight,
             "frame": self.frame_weight,
             "spread": self.spread_weight,
+        }
+
+    def disparity_weights(self) -> dict[str, float]:
+        """The same for a base of disparity."""
+        return {
+            "ssi": self.ssi_weight,
+            "temporal": self.temporal_weight,
+            "align_first": self.disparity_align_weight,
         }
 
 

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
-from dyfn_core.models.mini import MiniModel
+from dyfn_core.models.base import GeometryModel
 from dyfn_core.training.config import ConfigError
 
 META = "cache.json"
@@ -24,28 +24,31 @@ META = "cache.json"
 @dataclass(frozen=True)
 class LatentClips:
     """B clips of T frames: latent B x T x C x h x w and depth B x T x H x W (inf sky, NaN
-    invalid) in float16, normalised intrinsics B x T x 4, image_size (H, W)."""
+    invalid) in float16, normalised intrinsics B x T x 4, image_size (H, W) of the clip and
+    network_size that the latents were computed at."""
 
     latent: Tensor
     depth: Tensor
     intrinsics: Tensor
     image_size: tuple[int, int]
+    network_size: tuple[int, int]
 
     def __len__(self) -> int:
         return len(self.latent)
 
 
 @torch.no_grad()
-def encode_clips(model: MiniModel, batch: ClipBatch) -> LatentClips:
+def encode_clips(model: GeometryModel, batch: ClipBatch) -> LatentClips:
     """Every frame of every clip through the frozen encoder, one clip at a time."""
     size = (batch.image.shape[-2], batch.image.shape[-1])
-    device = model.device
-    latents = [
-        model.encode_at(clip.to(device).float() / 255, size).features.half().cpu()
-        for clip in batch.image
-    ]
+    tokens = max(1, round(size[0] * size[1] / model.token_cell**2))
+    latents = [model.encode(clip.to(model.device).float() / 255, tokens) for clip in batch.image]
     return LatentClips(
-        torch.stack(latents).contiguous(), batch.depth.half(), batch.intrinsics, size
+        torch.stack([latent.features.half().cpu() for latent in latents]).contiguous(),
+        batch.depth.half(),
+        batch.intrinsics,
+        size,
+        latents[0].network_size,
     )
 
 
@@ -56,7 +59,7 @@ class LatentCache:
     is an error, not a surprise. An interrupted build goes on where it stopped.
     """
 
-    def __init__(self, folder: Path, model: MiniModel, source: ClipSource, draws: int) -> None:
+    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
         self.folder, self.source, self.draws = folder, source, draws
         folder.mkdir(parents=True, exist_ok=True)
         self._check(_fingerprint(model, source))
@@ -75,7 +78,7 @@ class LatentCache:
                 "delete it or give another `cache`"
             )
 
-    def _build(self, model: MiniModel) -> None:
+    def _build(self, model: GeometryModel) -> None:
         missing = [index for index in range(self.draws) if not self._path(index).exists()]
         if not missing:
             return
@@ -87,6 +90,7 @@ class LatentCache:
                 "depth": clips.depth,
                 "intrinsics": clips.intrinsics,
                 "image_size": torch.tensor(clips.image_size),
+                "network_size": torch.tensor(clips.network_size),
             }
             partial = self._path(index).with_suffix(".partial")
             save_file(parts, partial)
@@ -98,7 +102,11 @@ class LatentCache:
     def _load(self, index: int) -> LatentClips:
         parts = load_file(self._path(index))
         height, width = parts["image_size"].tolist()
-        return LatentClips(parts["latent"], parts["depth"], parts["intrinsics"], (height, width))
+        # Caches of `mini` from before other models had none: it works at the clip's size.
+        rows, columns = parts.get("network_size", parts["image_size"]).tolist()
+        return LatentClips(
+            parts["latent"], parts["depth"], parts["intrinsics"], (height, width), (rows, columns)
+        )
 
     def batches(self, start: int, seed: int, clips: int, length: int) -> Iterator[LatentClips]:
         """Endless random batches of one size: sub-clips of `length`, as they were or reversed."""
@@ -111,7 +119,7 @@ class LatentCache:
             group = groups[int(torch.multinomial(counts, 1, generator=draw))]
             chosen = [_sub_clip(group, length, draw) for _ in range(clips)]
             latent, depth, intrinsics = (torch.stack(parts) for parts in zip(*chosen, strict=True))
-            yield LatentClips(latent, depth, intrinsics, group[0].image_size)
+            yield LatentClips(latent, depth, intrinsics, group[0].image_size, group[0].network_size)
             step += 1
 
 
@@ -133,7 +141,7 @@ def _sub_clip(
     return entry.latent[clip, index], entry.depth[clip, index], entry.intrinsics[clip, index]
 
 
-def _fingerprint(model: MiniModel, source: ClipSource) -> dict[str, Any]:
+def _fingerprint(model: GeometryModel, source: ClipSource) -> dict[str, Any]:
     digest = hashlib.sha256()
     for name, value in model.state_dict().items():
         if not name.startswith("stabilizer."):

@@ -13,13 +13,19 @@ from torch import Tensor
 
 from dyfn_core.data.clips import batch_loader, draw_batch, find_sequences
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
+from dyfn_core.losses.disparity import (
+    align_disparity,
+    disparity_alignment_loss,
+    disparity_temporal_loss,
+)
+from dyfn_core.losses.objective import Objective
 from dyfn_core.losses.scale_spread import scale_spread_loss
+from dyfn_core.losses.ssi import ssi_loss
 from dyfn_core.losses.target import target_from_depth
 from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
-from dyfn_core.models.base import Latent
+from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.mini import MiniModel, remap_exp
 from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 from dyfn_core.prediction import StreamState
 from dyfn_core.training.base import clip_source
@@ -34,9 +40,9 @@ VALIDATION_SEED = 1_000_000_007
 
 
 class StabilizerTask(Task):
-    """DyFN of a frozen `mini`; no other parameter has gradients."""
+    """DyFN of any frozen base; no other parameter has gradients."""
 
-    model: MiniModel
+    model: GeometryModel
 
     def __init__(
         self, config: StabilizerRunConfig, cache_folder: Path, device: torch.device | str = "cpu"
@@ -51,6 +57,8 @@ class StabilizerTask(Task):
             folder = config.cache or cache_folder
             self.cache = LatentCache(folder, self.model, self.source, config.cache_draws)
         self.sequences: dict[str, list[Sequence]] = {}
+        described = config.objective
+        self.objective = None if described is None else Objective.from_dict(described)
 
     def groups(self) -> list[dict[str, Any]]:
         stabilizer = self.model.stabilizer
@@ -71,18 +79,31 @@ class StabilizerTask(Task):
 
     def loss(self, batch: LatentClips) -> tuple[Tensor, dict[str, float]]:
         frames = self._decoded_frames()
-        latents = unroll(self.model, batch.latent.float())
-        points = self._decode(torch.stack([latents[j] for j in frames], 1), batch.image_size)
-        with full_precision(points):
-            return self._terms(batch, points, frames)
-
-    def _terms(
-        self, batch: LatentClips, points: Tensor, frames: list[int]
-    ) -> tuple[Tensor, dict[str, float]]:
+        stabilized = unroll(self.model, batch)
+        chosen = torch.stack([stabilized[j].features for j in frames], 1)
+        affine = self._decode(chosen, batch.image_size, stabilized[0].network_size)
         depth = batch.depth[:, frames].float().flatten(0, 1)
         aspect = batch.image_size[1] / batch.image_size[0]
         truth = target_from_depth(depth, batch.intrinsics[:, frames].flatten(0, 1), aspect)
         target = ClipTarget(truth, len(frames))
+        with full_precision(depth):
+            if isinstance(affine, AffineDisparity):
+                terms = self._disparity_terms(affine.disparity, target, frames)
+                weights = self.config.disparity_weights()
+                total = torch.stack([weights[name] * terms[name] for name in terms]).sum()
+            elif self.objective is not None:
+                terms = self.objective.terms(affine.points, affine.mask, target)
+                total = self.objective.total(terms, len(truth.points))
+            else:
+                terms = self._point_terms(affine.points, target, frames)
+                weights = self.config.loss_weights()
+                total = torch.stack([weights[name] * terms[name] for name in terms]).sum()
+        values = {name: float(term.detach()) for name, term in terms.items()}
+        return total, {"loss": float(total.detach()), **values}
+
+    def _point_terms(
+        self, points: Tensor, target: ClipTarget, frames: list[int]
+    ) -> dict[str, Tensor]:
         terms: dict[str, Tensor] = {}
         first_scale = None
         for mode in ("first", "all"):
@@ -93,26 +114,42 @@ class StabilizerTask(Task):
         pairs = window_pairs(frames, self.config.windows)
         assert first_scale is not None
         terms["temporal"] = temporal_loss(points, target, first_scale, pairs)
-        terms["frame"] = whole_frame_loss(points.flatten(0, 1), truth)[0]
+        terms["frame"] = whole_frame_loss(points.flatten(0, 1), target.frames)[0]
         terms["spread"] = scale_spread_loss(points, target)
-        weights = self.config.loss_weights()
-        total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
-        values = {name: float(term.detach()) for name, term in terms.items()}
-        return total, {"loss": float(total.detach()), **values}
+        return terms
+
+    def _disparity_terms(
+        self, disparity: Tensor, target: ClipTarget, frames: list[int]
+    ) -> dict[str, Tensor]:
+        scale, shift = align_disparity(disparity, target, "first")
+        pairs = window_pairs(frames, self.config.windows)
+        return {
+            "ssi": ssi_loss(disparity.flatten(0, 1), target.frames),
+            "temporal": disparity_temporal_loss(disparity, target, scale, pairs),
+            "align_first": disparity_alignment_loss(disparity, target, scale, shift),
+        }
 
     def _decoded_frames(self) -> list[int]:
         """The first frame, a run of neighbours for the temporal loss, and a few at random."""
         length, count = self.config.length, min(self.config.decoded, self.config.length)
+        if self.objective is not None:
+            return list(range(length))
         run = min(count - 1, max(self.config.windows) + 1)
         start = 1 + int(torch.randint(max(1, length - run), (1,)))
         chosen = {0, *range(start, min(start + run, length))}
         others = [j for j in torch.randperm(length).tolist() if j not in chosen]
         return sorted([*chosen, *others[: count - len(chosen)]])
 
-    def _decode(self, latents: Tensor, size: tuple[int, int]) -> Tensor:
-        """latents B x T x C x h x w -> points B x T x H/2 x W/2 x 3."""
-        raw, _ = self.model.decode_raw(Latent(latents.flatten(0, 1), size, size))
-        return remap_exp(raw.float()).unflatten(0, latents.shape[:2])
+    def _decode(
+        self, latents: Tensor, image_size: tuple[int, int], network_size: tuple[int, int]
+    ) -> AffinePoints | AffineDisparity:
+        """latents B x T x C x h x w -> what the model says, B x T x H/2 x W/2 (x 3)."""
+        half = (image_size[0] // 2, image_size[1] // 2)
+        affine = self.model.decode(Latent(latents.flatten(0, 1), half, network_size))
+        shape = latents.shape[:2]
+        if isinstance(affine, AffineDisparity):
+            return AffineDisparity(affine.disparity.unflatten(0, shape))
+        return AffinePoints(affine.points.unflatten(0, shape), affine.mask.unflatten(0, shape))
 
     def validate(self) -> dict[str, float]:
         """Image and video AbsRel with and without DyFN; `score` is the rendered video's."""
@@ -132,11 +169,13 @@ class StabilizerTask(Task):
         predicted = []
         for features in sequence.latent:
             features = features[None].to(self.model.device).float()
+            latent = Latent(features, sequence.image_size, sequence.network_size)
             if stabilized:
-                features, state = self.model.stabilize(features, state)
-            raw, _ = self.model.decode_raw(Latent(features, *2 * (sequence.image_size,)))
-            predicted.append(raw[0, 2].exp().cpu().numpy())
-        return sequence_scores(predicted, [depth.float().numpy() for depth in sequence.depth])
+                latent, state = self.model.stabilize_latent(latent, state)
+            affine = self._decode(latent.features[:, None], latent.image_size, latent.network_size)
+            predicted.append(compared(affine)[0, 0].cpu().numpy())
+        true = [depth.float().numpy() for depth in sequence.depth]
+        return sequence_scores(predicted, true, self.model.quantity)
 
     def _find_sequences(self) -> dict[str, list[Sequence]]:
         found = {"rendered": self._rendered_sequences()}
@@ -156,7 +195,7 @@ class StabilizerTask(Task):
         while len(sequences) < self.config.validation_clips:
             clips = encode_clips(self.model, draw_batch(source, found, draw))
             sequences += [
-                Sequence(latent, depth, clips.image_size)
+                Sequence(latent, depth, clips.image_size, clips.network_size)
                 for latent, depth in zip(clips.latent, clips.depth, strict=True)
             ]
             draw += 1
@@ -166,44 +205,60 @@ class StabilizerTask(Task):
         assert self.config.validation_rgbd is not None
         examples = recording_examples(self.config.validation_rgbd, self.config.validation_stride)
         latents, depths = [], []
-        size = self.model.network_size(examples[0].image.shape[:2], None)
+        size = (0, 0)
         for example in examples:
             image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
             image = image.to(self.model.device).float() / 255
-            latents.append(self.model.encode_at(image, size).features[0].half().cpu())
+            latent = self.model.encode(image)
+            size = latent.network_size
+            latents.append(latent.features[0].half().cpu())
             rows = (np.arange(size[0] // 2) * 2 + 1) * example.depth.shape[0] // size[0]
             cols = (np.arange(size[1] // 2) * 2 + 1) * example.depth.shape[1] // size[1]
             depths.append(torch.from_numpy(example.depth[rows[:, None], cols[None, :]]))
-        return Sequence(torch.stack(latents), torch.stack(depths), size)
+        return Sequence(torch.stack(latents), torch.stack(depths), size, size)
 
     def picture(self, batch: LatentClips) -> np.ndarray:
         """True depth, base and DyFN of one clip's frames, one colour scale a row."""
-        latent, size = batch.latent[:1].to(self.model.device).float(), batch.image_size
-        stabilized = torch.stack(unroll(self.model, latent), 1)
-        frames = list(range(0, latent.shape[1], max(1, latent.shape[1] // 6)))[:6]
+        one = replace(batch, latent=batch.latent[:1].to(self.model.device))
+        stabilized = unroll(self.model, one)
+        frames = list(range(0, len(stabilized), max(1, len(stabilized) // 6)))[:6]
         base, ours = (
-            self._decode(which[:, frames], size)[0, ..., 2].cpu().numpy()
-            for which in (latent, stabilized)
+            far_is_large(self._decode(latents[:, frames], batch.image_size, size))[0].cpu().numpy()
+            for latents, size in (
+                (one.latent.float(), batch.network_size),
+                (torch.stack([x.features for x in stabilized], 1), stabilized[0].network_size),
+            )
         )
         true = batch.depth[0, frames].float().cpu().numpy()
         return np.vstack([coloured_depth(np.hstack(list(row))) for row in (true, base, ours)])
 
 
-def unroll(model: MiniModel, latents: Tensor) -> list[Tensor]:
-    """latents B x T x C x h x w -> T stabilized latents, the state passed along."""
+def compared(affine: AffinePoints | AffineDisparity) -> Tensor:
+    """What is compared with truth: z of the points, or disparity."""
+    return affine.disparity if isinstance(affine, AffineDisparity) else affine.points[..., 2]
+
+
+def far_is_large(affine: AffinePoints | AffineDisparity) -> Tensor:
+    """z, or the inverse of disparity, for pictures."""
+    if isinstance(affine, AffineDisparity):
+        return 1 / affine.disparity.clamp(min=1e-6)
+    return affine.points[..., 2]
+
+
+def unroll(model: GeometryModel, clips: LatentClips) -> list[Latent]:
+    """The clips' T stabilized latents, the state passed along."""
     state: StreamState | None = None
     outputs = []
-    for features in latents.unbind(1):
-        stabilized, state = model.stabilize(features, state)
-        outputs.append(stabilized)
+    for features in clips.latent.float().unbind(1):
+        latent = Latent(features, clips.image_size, clips.network_size)
+        latent, state = model.stabilize_latent(latent, state)
+        outputs.append(latent)
     return outputs
 
 
-def build_frozen(config: StabilizerRunConfig) -> MiniModel:
+def build_frozen(config: StabilizerRunConfig) -> GeometryModel:
     """The base of a checkpoint, frozen, with a DyFN on it: a fresh one, or its own (warm_start)."""
     model = load_model(config.base)
-    if not isinstance(model, MiniModel):
-        raise ConfigError(f"base: {config.base} is no model of type 'mini'")
     model.requires_grad_(False)
     if config.warm_start:
         if model.stabilizer is None:
@@ -211,6 +266,6 @@ def build_frozen(config: StabilizerRunConfig) -> MiniModel:
         model.stabilizer.requires_grad_(True)
         return model.train()
     torch.manual_seed(config.seed)
-    described = StabilizerConfig(**config.stabilizer)
+    described = StabilizerConfig(**{"pool": model.stabilizer_pool, **config.stabilizer})
     model.stabilizer = build_stabilizer(model.latent_channels, described)
     return model.train()

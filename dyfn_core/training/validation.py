@@ -11,7 +11,8 @@ import torch
 
 from dyfn_core.data.frames import FrameSequence
 from dyfn_core.geometry.alignment import fit_scale_shift
-from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.base import AffineDisparity, GeometryModel
+from dyfn_core.prediction import DEPTH, DISPARITY
 
 SHORT_SIDE = 240  # frames are shrunk to this before they are encoded
 
@@ -64,7 +65,10 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
     for example in examples:
         image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
         latent = model.encode(image.to(model.device).float() / 255)
-        depth = model.decode(latent).points[0, ..., 2].cpu().numpy()
+        affine = model.decode(latent)
+        if isinstance(affine, AffineDisparity):
+            raise TypeError("single frames of a disparity model are scored by dyfn-eval")
+        depth = affine.points[0, ..., 2].cpu().numpy()
         valid = np.isfinite(example.depth) & (example.depth > 1e-3)
         if valid.sum() < 100:
             continue
@@ -78,33 +82,42 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Sequence:
-    """Consecutive frames, encoded: latent T x C x h x w; depth T x H x W metres."""
+    """Consecutive frames, encoded: latent T x C x h x w; depth T x H/2 x W/2 metres."""
 
     latent: torch.Tensor
     depth: torch.Tensor
     image_size: tuple[int, int]
+    network_size: tuple[int, int]
 
 
-def sequence_scores(predicted: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:
+def sequence_scores(
+    predicted: list[np.ndarray], true: list[np.ndarray], quantity: str = DEPTH
+) -> dict[str, float]:
     """AbsRel of a sequence under the image and video protocols (paper section 5).
 
-    predicted, true: per frame, h x w; true depth counts where it is finite and > 1e-3.
+    predicted, true: per frame, h x w; true depth counts where it is finite and > 1e-3. quantity:
+    of the prediction; disparity is aligned with 1 / depth.
     """
     pairs = []
     for ours, depth in zip(predicted, true, strict=True):
         valid = np.isfinite(depth) & (depth > 1e-3)
         if valid.sum() >= 16:
             pairs.append((ours[valid].astype(np.float64), depth[valid].astype(np.float64)))
-    joined = fit_scale_shift(
-        np.concatenate([p for p, _ in pairs]),
-        np.concatenate([d for _, d in pairs]),
-        1 / np.concatenate([d for _, d in pairs]),
+    joined = _fit(
+        np.concatenate([p for p, _ in pairs]), np.concatenate([d for _, d in pairs]), quantity
     )
-    return {
-        "image": float(np.mean([_abs_rel(p, d, fit_scale_shift(p, d, 1 / d)) for p, d in pairs])),
-        "video": float(np.mean([_abs_rel(p, d, joined) for p, d in pairs])),
-    }
+    alone = [_abs_rel(p, d, _fit(p, d, quantity), quantity) for p, d in pairs]
+    together = [_abs_rel(p, d, joined, quantity) for p, d in pairs]
+    return {"image": float(np.mean(alone)), "video": float(np.mean(together))}
 
 
-def _abs_rel(ours: np.ndarray, true: np.ndarray, fit: tuple[float, float]) -> float:
-    return float(np.mean(np.abs(np.maximum(fit[0] * ours + fit[1], 1e-3) - true) / true))
+def _fit(ours: np.ndarray, true: np.ndarray, quantity: str) -> tuple[float, float]:
+    if quantity == DISPARITY:
+        return fit_scale_shift(ours, 1 / true, true)
+    return fit_scale_shift(ours, true, 1 / true)
+
+
+def _abs_rel(ours: np.ndarray, true: np.ndarray, fit: tuple[float, float], quantity: str) -> float:
+    aligned = fit[0] * ours + fit[1]
+    depth = 1 / np.maximum(aligned, 1e-4) if quantity == DISPARITY else aligned
+    return float(np.mean(np.abs(np.maximum(depth, 1e-3) - true) / true))

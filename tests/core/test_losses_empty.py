@@ -1,0 +1,238 @@
+"""What holds no truth contributes nothing: zero loss, zero and finite gradients, in every term."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from dyfn_core.losses.canonical_scale import canonical_scale_loss
+from dyfn_core.losses.clip_alignment import (
+    ClipTarget,
+    align_clips,
+    align_clips_fully,
+    clip_alignment_loss,
+)
+from dyfn_core.losses.disparity import (
+    align_disparity,
+    disparity_alignment_loss,
+    disparity_temporal_loss,
+)
+from dyfn_core.losses.local import LocalLevel, ball_loss, local_loss
+from dyfn_core.losses.mask import mask_loss, mask_pixel_loss
+from dyfn_core.losses.normal import corner_normal_loss, edge_loss, normal_loss
+from dyfn_core.losses.objective import Objective
+from dyfn_core.losses.scale_spread import scale_spread_loss
+from dyfn_core.losses.ssi import ssi_loss
+from dyfn_core.losses.target import target_from_depth
+from dyfn_core.losses.temporal import released_temporal_loss, temporal_loss
+from dyfn_core.losses.whole_frame import (
+    align_frames_fully,
+    aligned_frame_loss,
+    whole_frame_loss,
+)
+
+FRAMES, HEIGHT, WIDTH = 3, 20, 28
+PAIRS = [(0, 1), (0, 2)]
+LEVEL = LocalLevel(1 / 2, 6, 4)
+
+
+def aligned(mode: str, fully: bool) -> Callable[[Tensor, ClipTarget], Tensor]:
+    def term(points: Tensor, target: ClipTarget) -> Tensor:
+        find = align_clips_fully if fully else align_clips
+        return clip_alignment_loss(points, target, *find(points, target, mode))
+
+    return term
+
+
+def disparity_of(points: Tensor) -> Tensor:
+    return 1 / points[..., 2]
+
+
+def by_frame(term: Callable[..., Tensor]) -> Callable[[Tensor, ClipTarget], Tensor]:
+    return lambda points, target: term(points.flatten(0, 1), target.frames).sum()
+
+
+def own_frames(points: Tensor, target: ClipTarget) -> Tensor:
+    flat = points.flatten(0, 1)
+    scale, shift = align_frames_fully(flat, target.frames, 8)
+    return aligned_frame_loss(flat, target.frames, scale, shift).sum()
+
+
+TERMS: dict[str, Callable[[Tensor, ClipTarget], Tensor]] = {
+    "align_first": aligned("first", False),
+    "align_all": aligned("all", False),
+    "align_first_fully": aligned("first", True),
+    "align_all_fully": aligned("all", True),
+    "temporal": lambda p, t: temporal_loss(p, t, align_clips(p, t, "first")[0], PAIRS),
+    "temporal_released": lambda p, t: released_temporal_loss(
+        p, t, align_clips(p, t, "first")[0], (1, 2)
+    ),
+    "frame": lambda p, t: whole_frame_loss(p.flatten(0, 1), t.frames)[0],
+    "frame_fully": own_frames,
+    "local": lambda p, t: local_loss(p.flatten(0, 1), t.frames, torch.ones(FRAMES), 1 / 2, 6),
+    "balls": by_frame(lambda p, t: ball_loss(p, t, LEVEL)),
+    "normal": by_frame(normal_loss),
+    "normal_corners": by_frame(corner_normal_loss),
+    "edge": by_frame(edge_loss),
+    "canonical_scale": by_frame(canonical_scale_loss),
+    "spread": scale_spread_loss,
+    "ssi": lambda p, t: ssi_loss(disparity_of(p).flatten(0, 1), t.frames),
+    "disparity_align": lambda p, t: disparity_alignment_loss(
+        disparity_of(p), t, *align_disparity(disparity_of(p), t, "first")
+    ),
+    "disparity_temporal": lambda p, t: disparity_temporal_loss(
+        disparity_of(p), t, align_disparity(disparity_of(p), t, "first")[0], PAIRS
+    ),
+}
+# These see single frames, or compare frames under an alignment from all: one frame is enough.
+ALONE = {
+    "align_first", "align_all", "align_first_fully", "align_all_fully", "frame", "frame_fully",
+    "local", "balls", "normal", "normal_corners", "edge", "canonical_scale", "ssi",
+    "disparity_align",
+}  # fmt: skip
+
+
+def depth(kind: str) -> Tensor:
+    torch.manual_seed(0)
+    coarse = 1 + 4 * torch.rand(FRAMES, 1, 3, 3)
+    found = torch.nn.functional.interpolate(
+        coarse, size=(HEIGHT, WIDTH), mode="bilinear", align_corners=True
+    )[:, 0]
+    if kind == "invalid":
+        return torch.full_like(found, math.nan)
+    if kind == "infinite":
+        return torch.full_like(found, math.inf)
+    if kind == "first":
+        found[1:] = math.nan
+    if kind == "last":
+        found[:-1] = math.inf
+    return found
+
+
+def run(name: str, kind: str) -> tuple[float, Tensor]:
+    frames = target_from_depth(
+        depth(kind), torch.tensor([0.8, 1.12, 0.5, 0.5]).expand(FRAMES, -1), WIDTH / HEIGHT
+    )
+    target = ClipTarget(frames, FRAMES)
+    full = target_from_depth(
+        depth("full"), torch.tensor([0.8, 1.12, 0.5, 0.5]).expand(FRAMES, -1), WIDTH / HEIGHT
+    )
+    torch.manual_seed(1)
+    points = full.points[None] * (1 + 0.2 * torch.rand(1, FRAMES, HEIGHT, WIDTH, 3))
+    points = points.requires_grad_()
+    loss = TERMS[name](points, target)
+    loss.backward()
+    assert points.grad is not None
+    return float(loss.detach()), points.grad[0]
+
+
+@pytest.mark.parametrize("kind", ["invalid", "infinite"])
+@pytest.mark.parametrize("name", TERMS)
+def test_clip_without_truth_is_nothing(name: str, kind: str) -> None:
+    loss, gradient = run(name, kind)
+    assert loss == 0
+    assert not bool(gradient.any())
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_clip_with_one_valid_frame_moves_that_frame_at_most(name: str) -> None:
+    for kind, valid in (("first", 0), ("last", FRAMES - 1)):
+        loss, gradient = run(name, kind)
+        assert math.isfinite(loss)
+        assert bool(torch.isfinite(gradient).all())
+        others = [j for j in range(FRAMES) if j != valid]
+        assert not bool(gradient[others].any())
+        if kind == "first" and name in ALONE:
+            assert loss > 0
+        if name not in ALONE:
+            assert loss == 0
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_clip_with_truth_has_a_gradient(name: str) -> None:
+    loss, gradient = run(name, "full")
+    assert loss > 0
+    assert bool(torch.isfinite(gradient).all())
+    assert bool(gradient.any())
+
+
+@pytest.mark.parametrize("kind", ["invalid", "infinite"])
+def test_masks_see_the_sky_but_not_the_unknown(kind: str) -> None:
+    frames = target_from_depth(depth(kind), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
+    mask = torch.full((FRAMES, HEIGHT, WIDTH), 0.5, requires_grad=True)
+    loss = mask_loss(mask, frames) + mask_pixel_loss(mask, frames).sum()
+    loss.backward()
+    assert mask.grad is not None
+    assert bool(mask.grad.any()) == (kind == "infinite")
+
+
+def test_ssi_ignores_scale_and_shift_but_not_shape() -> None:
+    frames = target_from_depth(depth("full"), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
+    true = 1 / frames.points[..., 2]
+    factors = torch.tensor([0.1, 1.0, 40.0])[:, None, None]
+    assert float(ssi_loss(factors * true + factors - 3, frames)) < 1e-4
+    assert float(ssi_loss(true.square(), frames)) > 0.02
+    spoiled = true.clone()
+    spoiled[:, 3:5, 3:5] += 100
+    trimmed, kept = ssi_loss(spoiled, frames), ssi_loss(spoiled, frames, trim=0.0)
+    assert float(trimmed) < float(kept)
+
+
+def test_disparity_alignment_finds_scale_and_shift() -> None:
+    frames = target_from_depth(depth("full"), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
+    target = ClipTarget(frames, FRAMES)
+    disparity = ((1 / frames.points[..., 2]) - 0.2)[None] / 3
+    for mode in ("first", "all"):
+        scale, shift = align_disparity(disparity, target, mode)
+        assert float(scale) == pytest.approx(3, rel=1e-3)
+        assert float(shift) == pytest.approx(0.2, abs=1e-3)
+        assert float(disparity_alignment_loss(disparity, target, scale, shift)) < 1e-4
+        assert float(disparity_temporal_loss(disparity, target, scale, PAIRS)) < 1e-4
+    with pytest.raises(ValueError, match="'last'"):
+        align_disparity(disparity, target, "last")
+
+
+@pytest.mark.parametrize("form", ["text", "released"])
+def test_every_term_of_the_objective_can_be_switched_off(form: str) -> None:
+    frames = target_from_depth(depth("full"), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
+    target = ClipTarget(frames, FRAMES)
+    points = (frames.points * (1 + 0.1 * torch.rand_like(frames.points)))[None].requires_grad_()
+    mask = torch.full((1, FRAMES, HEIGHT, WIDTH), 0.3)
+    names = ("align_first", "align_all", "frame", "local", "normal", "mask", "edge", "temporal")
+    off = dict.fromkeys(names, 0.0)
+    shared = {"form": form, "levels": (LEVEL,), "windows": (1,), "resolution": 8}
+    full = Objective(**{**dict.fromkeys(names, 1.0), **shared})  # type: ignore[arg-type]
+    torch.manual_seed(2)
+    everything = full.terms(points, mask, target)
+    for name in names:
+        objective = Objective(**{**off, **shared, name: 2.0})  # type: ignore[arg-type]
+        torch.manual_seed(2)
+        terms = objective.terms(points, mask, target)
+        (only,) = terms
+        assert only.startswith(name)
+        torch.testing.assert_close(terms[only], everything[only])
+        total = objective.total(terms, FRAMES)
+        share = 1 / (FRAMES + 1) if (form, name) == ("released", "temporal") else 1
+        torch.testing.assert_close(total, 2 * share * terms[only])
+
+
+def test_objective_of_a_clip_without_truth_is_zero() -> None:
+    frames = target_from_depth(depth("invalid"), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1)
+    points = torch.ones(1, FRAMES, HEIGHT, WIDTH, 3, requires_grad=True)
+    for objective in (Objective(levels=(LEVEL,)), Objective(form="released", levels=(LEVEL,))):
+        terms = objective.terms(points, points[..., 0], ClipTarget(frames, FRAMES))
+        total = objective.total(terms, FRAMES)
+        points.grad = None
+        total.backward()
+        assert float(total.detach()) == 0
+        assert points.grad is not None
+        assert not bool(points.grad.any())  # type: ignore[unreachable]
+
+
+def test_unknown_form_is_refused() -> None:
+    with pytest.raises(ValueError, match="'paper'"):
+        Objective(form="paper")

@@ -1,0 +1,112 @@
+"""`dyfn-train stabilizer` on every family: only DyFN changes, and its error is really followed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from made_frames import write_data_set
+
+from dyfn_core.cli.train import main
+from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.models.depth_anything import DepthAnythingConfig, DepthAnythingModel
+from dyfn_core.models.mini import MiniConfig, MiniModel
+from dyfn_core.models.moge import MoGeConfig, MoGeModel
+
+RUN = {
+    "kinds": ["clip"],
+    "stages": [{"from_step": 0, "batch": 1, "sizes": [[32, 64]]}],
+    "stabilizer": {"kind": "convgru", "hidden": 8},
+    "cache_draws": 2,
+    "cache_length": 4,
+    "strides": [1, 1],
+    "clips": 1,
+    "length": 4,
+    "decoded": 3,
+    "windows": [1, 2],
+    "steps": 3,
+    "threads": 1,
+    "log_every": 1,
+    "picture_every": 3,
+    "validate_every": 3,
+    "validation_clips": 1,
+    "warmup_steps": 1,
+    "learning_rate": 0.01,
+}
+
+
+def tiny(family: str) -> GeometryModel:
+    torch.manual_seed(0)
+    if family == "mini":
+        return MiniModel(MiniConfig(latent_channels=16, stage_channels=(16, 8)))
+    if family == "moge":
+        return MoGeModel(
+            MoGeConfig(
+                encoder="dinov2_vits14",
+                dim_proj=32,
+                dim_upsample=(32, 32, 32),
+                remap_output="exp",
+            )
+        )
+    made = DepthAnythingModel(DepthAnythingConfig())
+    torch.nn.init.constant_(made.depth_head.scratch.output_conv2[2].bias, 0.5)  # type: ignore[arg-type]
+    return made
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_data_set(tmp_path_factory.mktemp("data"))
+
+
+def train(folder: Path, data: Path, family: str, **changes: object) -> list[dict[str, float]]:
+    base = folder / "base.safetensors"
+    save_model(tiny(family), base)
+    config = folder / "config.yaml"
+    settings = {**RUN, "data": [str(data)], "base": str(base), **changes}
+    config.write_text(yaml.safe_dump(settings))
+    assert main(["stabilizer", str(config), "--out", str(folder / "run")]) == 0
+    return [json.loads(line) for line in (folder / "run" / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("family", ["mini", "moge", "dav2"])
+def test_base_is_trained_on_and_stays_as_it_was(data: Path, family: str, tmp_path: Path) -> None:
+    log = train(tmp_path, data, family)
+    before = tiny(family).state_dict()
+    trained = load_model(tmp_path / "run" / "model.safetensors")
+    after = trained.state_dict()
+    for key, value in before.items():
+        assert torch.equal(after[key], value), key
+    moved = [key for key in after if key.startswith("stabilizer.gamma_head.weight")]
+    assert all(bool(after[key].any()) for key in moved)
+    assert moved
+    assert trained.stabilizer is not None
+    assert trained.stabilizer.config.pool == (4 if family == "dav2" else 1)
+    (step, *_) = [line for line in log if line["group"] == "train"]  # type: ignore[comparison-overlap]
+    names = {"ssi", "temporal"} if family == "dav2" else {"frame", "temporal", "align_first"}
+    assert names <= set(step)
+    assert ("spread" in step) == (family != "dav2")
+    scores = [line for line in log if line["group"] != "train"]  # type: ignore[comparison-overlap]
+    assert any("rendered_dyfn_video" in line for line in scores)
+
+
+def test_the_whole_objective_can_train_it(data: Path, tmp_path: Path) -> None:
+    level = {"alpha": 0.5, "anchors": 4, "resolution": 4}
+    objective = {"levels": [level], "resolution": 6, "windows": [1, 2], "edge": 0.1}
+    log = train(tmp_path, data, "mini", objective=objective)
+    step = next(line for line in log if line["group"] == "train")  # type: ignore[comparison-overlap]
+    assert {"align_first", "frame", "local_0", "normal", "mask", "edge", "temporal"} <= set(step)
+
+
+def test_unknown_key_of_the_objective_names_the_nearest(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_model(tiny("mini"), tmp_path / "base.safetensors")
+    config = tmp_path / "config.yaml"
+    wrong = {"objective": {"temporl": 1.0}, "base": str(tmp_path / "base.safetensors")}
+    config.write_text(yaml.safe_dump({**RUN, "data": [str(data)], **wrong}))
+    assert main(["stabilizer", str(config), "--out", str(tmp_path / "run")]) != 0
+    assert "temporl" in capsys.readouterr().err
