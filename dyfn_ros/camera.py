@@ -6,13 +6,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dyfn_ros import messages
 from dyfn_ros.calibration import CalibrationRules, Calibrator, View
 from dyfn_ros.camera_stream import (
     REQUESTED,
@@ -20,14 +19,21 @@ from dyfn_ros.camera_stream import (
     Geometry,
     StreamFrame,
     StreamHook,
-    StreamMaker,
     TimeRules,
+    stream_maker,
 )
-from dyfn_ros.messages import MessageError
+from dyfn_ros.compressed_image import decode_compressed
+from dyfn_ros.messages import MessageError, decode_image
+from dyfn_ros.metric_scale import MetricHook, ScalePorts
 from dyfn_ros.outputs import Outputs
 from dyfn_ros.parameter_table import Settings
 from dyfn_ros.ports import Ports
+from dyfn_ros.scene_cut import SceneCutHook
+from dyfn_ros.state_file import StateError, StateHook, path_for
 from dyfn_ros.statistics import FrameStatistics
+
+if TYPE_CHECKING:
+    from dyfn_core.models.base import GeometryModel
 
 _SENSOR_DEPTH = 5
 
@@ -87,6 +93,8 @@ class Camera:
         self._epoch_lock = threading.Lock()
         self._subscribe(ports)
         self._calibrator = Calibrator(lambda text: warn(f"{self.info_topic}: {text}"))
+        self._scale_ports = ScalePorts(ports, self.prefix, self.title, settings())
+        self.state: StateHook | None = None  # once there is a model
 
     @property
     def prefix(self) -> str:
@@ -140,18 +148,53 @@ class Camera:
         with self._epoch_lock:
             self._epoch, self._request = self._epoch + 1, reason
 
+    # Any thread.
+
+    def save_state(self) -> str:
+        """-> what was saved. Raises StateError."""
+        return self._opened().save(self._state_file())
+
+    def load_state(self) -> str:
+        """As request_reset, with the state of a file. -> what was loaded. Raises StateError."""
+        settings = self.settings
+
+        def begin() -> int:
+            self.request_reset(REQUESTED)
+            return self._epoch
+
+        path = self._state_file()
+        return self._opened().load(path, begin, settings.stabilize, settings.num_tokens)
+
+    def _opened(self) -> StateHook:
+        if self.state is None:
+            raise StateError("the model is not loaded yet")
+        return self.state
+
+    def _state_file(self) -> str:
+        settings = self.settings
+        return path_for(settings.state_file, self.name, len(settings.cameras) > 1)
+
     # Inference thread.
 
-    def open_stream(self, make: StreamMaker) -> None:
-        """Once, before the first frame."""
-        self.stream.make = make
+    def open_stream(self, model: GeometryModel) -> None:
+        """Once, before the first frame. Raises ValueError when a metric setting is unusable."""
+        source = self.settings.metric_source
+        if model.quantity == "disparity" and source != "none":
+            raise ValueError(
+                f"metric_source is {source!r}, but the model predicts disparity, whose unknown "
+                "shift no metric scale undoes; expected 'none'"
+            )
+        self.stream.make = stream_maker(model)
+        cut = SceneCutHook(lambda: self.settings.scene_cut_threshold)
+        metric = MetricHook(lambda: self.settings, self._scale_ports, self._warn)
+        self.state = StateHook(self.stream, metric, cut, model)
+        self.hooks += [cut, metric, self.state]
 
     def decode(self, job: Job) -> tuple[StreamFrame, View]:
         """Raises MessageError when the image, or its lens, cannot be used."""
         settings = self.settings
         compressed = settings.image_transport == "compressed"
-        decode = messages.decode_compressed if compressed else messages.decode_image
-        image = decode(job.message)
+        image = decode_compressed(job.message) if compressed else decode_image(job.message)
         header = job.message.header
         view = self._calibrator.view(
             image,

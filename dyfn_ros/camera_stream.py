@@ -123,9 +123,17 @@ class StreamHook:
         """What to publish instead of the geometry."""
         return geometry
 
+    def adopt(self, frame: StreamFrame) -> tuple[StreamKey, DepthStream, int] | None:
+        """A stream to go on with from this frame, its key and epoch, instead of the own one."""
+        return None
+
     def report(self) -> dict[str, str]:
         """For diagnostics, any thread: name and value."""
         return {}
+
+    def problems(self) -> list[str]:
+        """For diagnostics, any thread: what a user should look at."""
+        return []
 
 
 @dataclass(frozen=True)
@@ -198,6 +206,10 @@ class CameraStream:
 
     def begin(self, frame: StreamFrame) -> DepthStream:
         """The stream that this frame goes into, started anew if it must be."""
+        for hook in self.hooks:
+            if (adopted := hook.adopt(frame)) is not None:
+                self._key, self.stream, self._epoch = adopted
+                self._stamp, self._failed = None, False  # time went by, that is no gap
         first = self.stream is None and not self._failed
         reason = None if first else self._reason(frame)
         for hook in self.hooks:

@@ -15,12 +15,13 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from dyfn_ros.camera import Camera, Job
-from dyfn_ros.camera_stream import REQUESTED, TIME_JUMP, stream_maker
+from dyfn_ros.camera_stream import REQUESTED, TIME_JUMP
 from dyfn_ros.diagnostics import Report, node_diagnostics
 from dyfn_ros.inference import run_jobs
 from dyfn_ros.parameter_table import Settings
 from dyfn_ros.parameters import NodeParameters
 from dyfn_ros.ports import Ports
+from dyfn_ros.state_file import StateError
 from dyfn_ros.throttle import Throttle
 from dyfn_ros.worker import FrameWorker
 
@@ -183,11 +184,17 @@ class StreamDepthNode(LifecycleNode):
     def _make_services(self) -> None:
         """Trigger services, the clock's jump callback, and the timer of the diagnostics."""
         everyone = list(range(len(self._cameras)))
-        topics = {"~/reset": everyone}
-        topics.update({f"~/{c.name}/reset": [i] for i, c in enumerate(self._cameras) if c.name})
-        for topic, indices in topics.items():
-            service = self.create_service(Trigger, topic, partial(self._on_reset, indices))
-            self._made.append(partial(self.destroy_service, service))
+        prefixes = {"~": everyone}
+        prefixes.update({f"~/{c.name}": [i] for i, c in enumerate(self._cameras) if c.name})
+        answers: dict[str, Callable[..., Trigger.Response]] = {
+            "reset": self._on_reset,
+            "save_state": partial(self._on_state, "save_state"),
+            "load_state": partial(self._on_state, "load_state"),
+        }
+        for prefix, indices in prefixes.items():
+            for name, answer in answers.items():
+                service = self.create_service(Trigger, f"{prefix}/{name}", partial(answer, indices))
+                self._made.append(partial(self.destroy_service, service))
         self._made.append(self._watch_clock().unregister)
         period = self.settings.diagnostics_period
         timer = self.create_timer(
@@ -219,6 +226,26 @@ class StreamDepthNode(LifecycleNode):
         response.success = True
         response.message = f"the next frame starts anew ({dropped} waiting frames dropped)"
         self.get_logger().info(f"reset: {response.message}")
+        return response
+
+    def _on_state(
+        self, what: str, indices: list[int], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """save_state or load_state of each camera; success when all of them worked."""
+        lines, response.success = [], True
+        for camera in (self._cameras[index] for index in indices):
+            title = f"{camera.name}: " if camera.name else ""
+            try:
+                lines.append(title + getattr(camera, what)())
+            except StateError as error:
+                response.success = False
+                lines.append(f"{title}{error}")
+        response.message = "; ".join(lines)
+        logger = self.get_logger()
+        if response.success:
+            logger.info(f"{what}: {response.message}")
+        else:
+            logger.error(f"{what}: {response.message}")
         return response
 
     def _reset(self, index: int, reason: str) -> int:
@@ -258,14 +285,15 @@ class StreamDepthNode(LifecycleNode):
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         model = self._load(settings.model, device)
-        make = stream_maker(model)
         for camera in self._cameras:
-            camera.open_stream(make)
+            camera.open_stream(model)
         self._device = device
         if self.context.ok():  # loading takes long enough to be interrupted
-            self.get_logger().info(
-                f"{settings.model} on {device}; depth is right up to one scale, which is not metres"
-            )
+            sources = {camera.settings.metric_source for camera in self._cameras} - {"none"}
+            unit = f"metres come from {', '.join(sorted(sources))}"
+            if not sources:
+                unit = "depth is right up to one scale, which is not metres"
+            self.get_logger().info(f"{settings.model} on {device}; {unit}")
             if model.quantity == "disparity":
                 self.get_logger().warning(
                     f"{settings.model} predicts disparity, right up to scale and shift: the depth "

@@ -108,4 +108,5 @@ def _camera_problems(report: Report, camera: Camera, snapshot: Snapshot) -> list
         problems.append((WARN, f"no images on {camera.image_topic}"))
     if not snapshot.same_clock:
         problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
+    problems += [(WARN, text) for hook in camera.hooks for text in hook.problems()]
     return problems

@@ -4,46 +4,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
-Value = str | bool | int | float | list[str]
+from dyfn_ros.metric_parameters import SCALE, MetricSettings
+from dyfn_ros.parameter_spec import CONFIGURE, MARKS, RUN, START, Spec
+from dyfn_ros.parameter_spec import parameter as _parameter
 
-START = "start"  # read only
-CONFIGURE = "configure"  # while the node is unconfigured
-RUN = "run"  # at any time
-MARKS = {START: "*", CONFIGURE: "+", RUN: ""}
-
-
-@dataclass(frozen=True)
-class Spec:
-    """One parameter.
-
-    group: heading in the manual. changes: START, CONFIGURE or RUN. per_camera: a named camera may
-    have a value of its own, `CAMERA.NAME`. range: both ends are allowed. choices: for strings.
-    """
-
-    default: Value
-    description: str
-    group: str
-    changes: str = CONFIGURE
-    per_camera: bool = False
-    range: tuple[float, float] | None = None
-    choices: tuple[str, ...] = ()
-
-
-def _parameter(group: str, default: Value, description: str, **options: Any) -> Any:
-    spec = Spec(default, description, group, **options)
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata={"spec": spec})
-    return field(default=default, metadata={"spec": spec})
-
+__all__ = [
+    "CONFIGURE",
+    "LIMITS",
+    "MARKS",
+    "RUN",
+    "SPECS",
+    "START",
+    "Settings",
+    "Spec",
+    "groups",
+    "show",
+]
 
 _NODE, _INPUT, _STREAM, _OUTPUT, _CLOUD = "Node", "Input", "Stream", "Output", "Cloud"
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(MetricSettings):
     """The values in force; a new one for each change. The fields are the table."""
 
     cameras: list[str] = _parameter(
@@ -167,6 +152,24 @@ class Settings:
         range=(0.0, 1e6),
     )
 
+    scene_cut_threshold: float = _parameter(
+        _STREAM,
+        0.5,
+        "Difference of two pictures in a row beyond which the camera is somewhere else and the "
+        "stream starts anew; 0 switches it off. See docs/metric_scale.md.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 2.0),
+    )
+    state_file: str = _parameter(
+        _STREAM,
+        "",
+        "Where ~/save_state writes and ~/load_state reads. Several cameras that share it put their "
+        "name before the suffix.",
+        changes=RUN,
+        per_camera=True,
+    )
+
     publish_depth: bool = _parameter(
         _OUTPUT, True, "Publish ~/depth/... when somebody subscribes.", changes=RUN, per_camera=True
     )
@@ -180,6 +183,13 @@ class Settings:
         changes=RUN,
         per_camera=True,
         choices=("32FC1", "16UC1"),
+    )
+    publish_colored: bool = _parameter(
+        _OUTPUT,
+        True,
+        "Publish ~/depth/colored when somebody subscribes.",
+        changes=RUN,
+        per_camera=True,
     )
     min_depth: float = _parameter(
         _OUTPUT,
@@ -250,12 +260,15 @@ def show(value: Any) -> str:
     """A default as YAML has it."""
     if isinstance(value, list):
         return f"[{', '.join(repr(item) for item in value)}]"
+    if value == "":
+        return "''"
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def groups() -> dict[str, dict[str, Spec]]:
     """The table by heading, in order."""
-    result: dict[str, dict[str, Spec]] = {}
+    order = (_NODE, _INPUT, _STREAM, SCALE, _OUTPUT, _CLOUD)
+    result: dict[str, dict[str, Spec]] = {group: {} for group in order}
     for name, spec in SPECS.items():
-        result.setdefault(spec.group, {})[name] = spec
+        result[spec.group][name] = spec
     return result

@@ -33,10 +33,11 @@ def to_plain(value: Any, tensors: dict[str, Tensor], kinds: Kinds) -> Any:
         return {kind: [to_plain(one, tensors, kinds) for one in value]}
     if isinstance(value, (Tensor, np.ndarray)):
         name = f"{len(tensors):04d}"
-        is_array = isinstance(value, np.ndarray)
-        tensor = torch.from_numpy(np.ascontiguousarray(value)) if is_array else value
-        tensors[name] = tensor.detach().cpu().contiguous().clone()
-        return {"array" if is_array else "tensor": name}
+        if isinstance(value, np.ndarray):
+            tensors[name] = torch.from_numpy(value.copy(order="C"))
+            return {"array": name}
+        tensors[name] = value.detach().cpu().contiguous().clone()
+        return {"tensor": name}
     if isinstance(value, dict):
         kind = "counter" if isinstance(value, Counter) else "dict"
         return {kind: {str(key): to_plain(one, tensors, kinds) for key, one in value.items()}}

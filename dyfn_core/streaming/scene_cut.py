@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-SIZE = (48, 36)  # width, height of the small picture
+SIZE = (32, 24)  # width, height of the small picture
 GRID = (4, 4)  # blocks across and down
 BLOCK = (SIZE[0] // GRID[0], SIZE[1] // GRID[1])
-REACH = (30, 20)  # pixels of displacement that are searched, across and down
-SLACK = 5  # size of the window within which a block may deviate from the common displacement
+REACH = (20, 14)  # pixels of displacement that are searched, across and down
+SLACK = 3  # size of the window within which a block may deviate from the common displacement
 _TEXTURE = 3.0  # grey levels of standard deviation below which a block shows nothing
 _FEWEST = 5  # blocks that must be comparable for a displacement to count
 _BINS = 8  # of the histogram, along each of two chromaticities
@@ -23,7 +23,7 @@ _BLANK_PATIENCE = 10  # blank pictures before the last scene is forgotten
 class Look:
     """A picture as the detector remembers it.
 
-    opponent: 36 x 48 x 3 float32, grey, red - green, blue - yellow. texture: 16 float32,
+    opponent: 24 x 32 x 3 float32, grey, red - green, blue - yellow. texture: 16 float32,
     standard deviation of each block of its grey.
     colours: 64 float32, chromaticity histogram, sums to 1.
     """
@@ -68,33 +68,48 @@ def structure_difference(before: Look, now: Look) -> float:
     touches; the best common displacement counts, give or take SLACK pixels a block, and of its
     blocks the better half: the others may be occluded.
     """
-    surfaces = []
-    for row in range(GRID[1]):
-        for column in range(GRID[0]):
-            if before.texture[row * GRID[0] + column] > _TEXTURE:
-                surfaces.append(_surface(before.opponent, now.opponent, row, column))
-    if len(surfaces) < _FEWEST:
+    shown = before.texture > _TEXTURE
+    if shown.sum() < _FEWEST:
         return math.nan
-    stack = np.sort(np.stack(surfaces), axis=0)[::-1]  # -2 marks what lies outside, so it is last
-    inside = (stack > -1.5).sum(axis=0)
-    kept = np.maximum((np.maximum(inside, len(surfaces) // 2) + 1) // 2, 1)
-    total = np.cumsum(np.maximum(stack, 0), axis=0)
-    score = np.take_along_axis(total, kept[None] - 1, axis=0)[0] / kept
+    blocks = _windows(before.opponent)[:: BLOCK[1], :: BLOCK[0]]
+    blocks = blocks.reshape(len(shown), -1)[shown]
+    windows = _windows(now.opponent)
+    found = (windows.reshape(-1, windows.shape[-1]) @ blocks.T).reshape(*windows.shape[:2], -1)
+    found = cv2.dilate(found, np.ones((SLACK, SLACK), np.uint8)).reshape(found.shape)
+    # Of each displacement, the blocks sorted by correlation; those that it moves out come last.
+    rows, columns, inside = _DISPLACED
+    stack = np.where(
+        inside[..., shown], found[rows[..., shown], columns[..., shown], np.arange(shown.sum())], -2
+    )
+    stack = np.sort(stack, axis=-1)[..., ::-1]
+    compared = np.maximum(inside[..., shown].sum(axis=-1), shown.sum() // 2)
+    better = np.maximum((compared + 1) // 2, 1)
+    total = np.cumsum(np.maximum(stack, 0), axis=-1)
+    score = np.take_along_axis(total, better[..., None] - 1, axis=-1)[..., 0] / better
     return float(1 - score.max())
 
 
-def _surface(before: np.ndarray, now: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Correlation of one block over all displacements; -2 where it would leave the picture."""
-    x, y = column * BLOCK[0], row * BLOCK[1]
-    template = before[y : y + BLOCK[1], x : x + BLOCK[0]]
-    left, top = max(0, x - REACH[0]), max(0, y - REACH[1])
-    right, bottom = min(SIZE[0], x + REACH[0] + BLOCK[0]), min(SIZE[1], y + REACH[1] + BLOCK[1])
-    found = cv2.matchTemplate(now[top:bottom, left:right], template, cv2.TM_CCOEFF_NORMED)
-    found = cv2.dilate(found, np.ones((SLACK, SLACK), np.uint8))
-    surface = np.full((2 * REACH[1] + 1, 2 * REACH[0] + 1), -2.0, np.float32)
-    first_y, first_x = top - y + REACH[1], left - x + REACH[0]
-    surface[first_y : first_y + found.shape[0], first_x : first_x + found.shape[1]] = found
-    return surface
+def _windows(picture: np.ndarray) -> np.ndarray:
+    """Every block-sized window, without its mean colour and of unit length: y x x x values."""
+    views = np.lib.stride_tricks.sliding_window_view(picture, (BLOCK[1], BLOCK[0]), axis=(0, 1))
+    flat = views.reshape(*views.shape[:3], -1)
+    flat = flat - flat.mean(axis=-1, keepdims=True)
+    flat = flat.reshape(*flat.shape[:2], -1)
+    return flat / np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-3)
+
+
+def _displaced() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each displacement (down, across) and block: where it then is, and whether in view."""
+    # Every other displacement: SLACK covers those between.
+    down, across = np.mgrid[-REACH[1] : REACH[1] + 1 : 2, -REACH[0] : REACH[0] + 1 : 2]
+    top, left = np.mgrid[: SIZE[1] : BLOCK[1], : SIZE[0] : BLOCK[0]]
+    rows, columns = down[..., None] + top.reshape(-1), across[..., None] + left.reshape(-1)
+    last = (SIZE[1] - BLOCK[1], SIZE[0] - BLOCK[0])
+    inside = (rows >= 0) & (rows <= last[0]) & (columns >= 0) & (columns <= last[1])
+    return rows.clip(0, last[0]), columns.clip(0, last[1]), inside
+
+
+_DISPLACED = _displaced()
 
 
 def colour_difference(before: Look, now: Look) -> float:

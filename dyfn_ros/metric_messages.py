@@ -1,0 +1,157 @@
+"""Messages of distance sensors -> measurements in the camera's optical frame.
+
+Reads any object with the fields of the ROS type, as messages.py does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dyfn_ros import messages
+from dyfn_ros.messages import MessageError
+
+if TYPE_CHECKING:
+    from dyfn_core.metric.references import Reference
+
+REFERENCE_TYPES = ("Image", "PointCloud2", "LaserScan", "Range")
+ULTRASOUND = 0  # sensor_msgs/Range.radiation_type
+_FORMATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField: FLOAT32, FLOAT64
+# REP 103: a body frame (x forward, y left, z up) seen from an optical one at the same place.
+_BODY_TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+@dataclass(frozen=True)
+class Transform:
+    """rotation 3 x 3 and translation 3 (metres): from the sensor's frame to the optical frame."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """N x 3 -> N x 3."""
+        return points @ self.rotation.T + self.translation
+
+
+def parse_transform(text: str, kind: str) -> Transform:
+    """ "x y z qx qy qz qw" (commas allowed), the sensor's pose in the camera's optical frame.
+
+    "" is the camera's own place: optical axes for PointCloud2, those of REP 103 (x forward) for
+    LaserScan and Range. A depth Image is registered to the camera and has none.
+    Raises ValueError that says what was expected.
+    """
+    if kind not in REFERENCE_TYPES:
+        raise ValueError(f"reference_type is {kind!r}, expected one of {REFERENCE_TYPES}")
+    if not text.strip():
+        turned = kind in ("LaserScan", "Range")
+        return Transform(_BODY_TO_OPTICAL if turned else np.eye(3), np.zeros(3))
+    expected = f"reference_transform is {text!r}, expected seven numbers 'x y z qx qy qz qw'"
+    if kind == "Image":
+        raise ValueError(f"{expected[: expected.index(',')]}, but a depth Image must be registered")
+    try:
+        values = np.array([float(part) for part in text.replace(",", " ").split()])
+    except ValueError as error:
+        raise ValueError(expected) from error
+    if len(values) != 7 or not np.isfinite(values).all():
+        raise ValueError(expected)
+    norm = float(np.linalg.norm(values[3:]))
+    if abs(norm - 1) > 1e-2:
+        raise ValueError(f"{expected} with a quaternion of length 1, not {norm:.3f}")
+    return Transform(_rotation(values[3:] / norm), values[:3])
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Unit quaternion x y z w -> 3 x 3."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def decode_points(message: Any) -> np.ndarray:
+    """sensor_msgs/PointCloud2 -> N x 3 float64, the sensor's frame; non-finite values stay.
+
+    x, y, z may be FLOAT32 or FLOAT64 at any offset, rows may be padded, either byte order.
+    Raises MessageError when a coordinate is absent, or the data has not the bytes it should.
+    """
+    fields = {field.name: field for field in message.fields}
+    missing = [axis for axis in "xyz" if axis not in fields]
+    if missing:
+        raise MessageError(f"the cloud has fields {sorted(fields)}, expected x, y and z")
+    order = ">" if message.is_bigendian else "<"
+    formats = []
+    for axis in "xyz":
+        number = _FORMATS.get(int(fields[axis].datatype))
+        if number is None or int(fields[axis].count) > 1:
+            raise MessageError(f"{axis} of the cloud is no FLOAT32 or FLOAT64")
+        formats.append(order + number)
+    step, width, height = int(message.point_step), int(message.width), int(message.height)
+    try:
+        layout = np.dtype(
+            {
+                "names": list("xyz"),
+                "formats": formats,
+                "offsets": [int(fields[axis].offset) for axis in "xyz"],
+                "itemsize": step,
+            }
+        )
+    except ValueError as error:
+        raise MessageError(f"point_step {step} does not hold x, y and z: {error}") from error
+    data = np.frombuffer(message.data, np.uint8) if len(message.data) else np.empty(0, np.uint8)
+    row_step = int(message.row_step) or step * width
+    if row_step < step * width or data.size < row_step * height:
+        raise MessageError(
+            f"cloud of {width} x {height} points, point_step {step}, row_step {row_step}, has "
+            f"{data.size} bytes"
+        )
+    rows = data[: row_step * height].reshape(height, row_step)[:, : step * width]
+    cloud = np.ascontiguousarray(rows).reshape(-1).view(layout)
+    return np.column_stack([cloud[axis].astype(np.float64) for axis in "xyz"])
+
+
+def decode_scan(message: Any) -> np.ndarray:
+    """sensor_msgs/LaserScan -> N x 3 float64 metres (x forward, z = 0); out of range is NaN."""
+    ranges = np.asarray(message.ranges, np.float64)
+    angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+    good = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
+    ranges = np.where(good & (ranges > 0), ranges, np.nan)
+    return np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles), 0 * ranges])
+
+
+def decode_range(message: Any) -> tuple[float, float, bool]:
+    """sensor_msgs/Range -> distance (metres, NaN when out of range), half angle, is it sound.
+
+    Raises MessageError for a field of view that is none.
+    """
+    view = float(message.field_of_view)
+    if not (math.isfinite(view) and 0 <= view < math.pi):
+        raise MessageError(f"field_of_view is {view}, expected radians in 0..pi")
+    distance = float(message.range)
+    good = math.isfinite(distance) and message.min_range <= distance <= message.max_range
+    return distance if good else math.nan, view / 2, int(message.radiation_type) == ULTRASOUND
+
+
+def reference_decoder(kind: str, transform: Transform) -> Callable[[Any], Reference]:
+    """The function that makes a measurement of a message of this type; raises MessageError."""
+    from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
+
+    def cone(message: Any) -> Reference:
+        distance, half_angle, sound = decode_range(message)
+        hit = transform(np.array([[distance, 0.0, 0.0]]))[0]
+        return ConeReference(hit, half_angle, nearest=sound)
+
+    decoders: dict[str, Callable[[Any], Reference]] = {
+        "Image": lambda message: DepthReference(messages.decode_depth(message)),
+        "PointCloud2": lambda message: PointReference(transform(decode_points(message))),
+        "LaserScan": lambda message: PointReference(transform(decode_scan(message))),
+        "Range": cone,
+    }
+    return decoders[kind]
