@@ -1,0 +1,237 @@
+"""Recordings as training data: what is read, what is skipped, and a run on one."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dyfn_core.cli.train import main
+from dyfn_core.data import datasets
+from dyfn_core.data.datasets import data_kind, open_kind
+from dyfn_core.data.frames import DataError
+from dyfn_core.data.pool import DataSpec, open_pool
+from dyfn_core.models.checkpoints import load_model
+from dyfn_ros.recording_writer import COMPRESSED_IMAGE, RecordingWriter, compressed_message
+
+SIZE = (48, 64)
+CAMERA = np.array([[50.0, 0, 30.5], [0, 52.0, 24.5], [0, 0, 1]])
+PERIOD = 100_000_000  # ns
+DEPTH = "/camera/depth/image"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("DYFN_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def picture(index: int) -> np.ndarray:
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]] / 8.0
+    waves = [np.sin(x + index / 3 + k) + np.cos(y - k) for k in range(3)]
+    return (np.stack(waves, -1) * 50 + 128).astype(np.uint8)
+
+
+def metres(index: int) -> np.ndarray:
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    depth = 1 + 0.05 * x + 0.02 * y + 0.1 * index
+    depth[:4] = np.nan
+    return np.round(depth, 3)
+
+
+Writer = Callable[[RecordingWriter, np.ndarray, int], None]
+
+
+def as_16uc1(writer: RecordingWriter, depth: np.ndarray, stamp: int) -> None:
+    writer.write_depth(DEPTH, depth, stamp, "camera", "16UC1")
+
+
+def as_32fc1(writer: RecordingWriter, depth: np.ndarray, stamp: int) -> None:
+    writer.write_depth(DEPTH, depth, stamp, "camera", "32FC1")
+
+
+def as_compressed_depth(writer: RecordingWriter, depth: np.ndarray, stamp: int) -> None:
+    millimetres = np.round(np.nan_to_num(depth) * 1000).astype(np.uint16)
+    data = struct.pack("<iff", 0, 0, 0) + cv2.imencode(".png", millimetres)[1].tobytes()
+    layout = "16UC1; compressedDepth png"
+    message = compressed_message(np.frombuffer(data, np.uint8), layout, stamp, "camera")
+    writer.write(f"{DEPTH}/compressedDepth", COMPRESSED_IMAGE, message, stamp)
+
+
+def write_recording(
+    path: Path,
+    frames: int = 6,
+    write_depth: Writer | None = as_16uc1,
+    late: int = 0,
+    without_depth: tuple[int, ...] = (),
+    gap_before: int | None = None,
+    info: bool = True,
+) -> Path:
+    """Frames 0.1 s apart (2 s before `gap_before`), their depth `late` ns after them."""
+    with RecordingWriter(path) as writer:
+        for index in range(frames):
+            stamp = 1_000_000_000 + index * PERIOD
+            if gap_before is not None and index >= gap_before:
+                stamp += 2_000_000_000
+            if info:
+                writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "camera")
+            writer.write_image("/camera/image", picture(index), stamp, "camera")
+            if write_depth is not None and index not in without_depth:
+                write_depth(writer, metres(index), stamp + late)
+    return path
+
+
+@pytest.mark.parametrize("write_depth", [as_16uc1, as_32fc1, as_compressed_depth])
+@pytest.mark.parametrize("name", ["run.mcap", "run.db3", "bag"])
+def test_frames_come_back_by_value(write_depth: Writer, name: str, tmp_path: Path) -> None:
+    path = write_recording(tmp_path / name, 3, write_depth, late=15_000_000)
+    pool = open_pool((DataSpec(path),), "train", 3)
+    (sequence,) = pool.sequences
+    for index in range(3):
+        frame = sequence.read(index)
+        np.testing.assert_allclose(frame.depth, metres(index), rtol=6e-4)
+        assert np.isnan(frame.depth[:4]).all()
+        assert np.abs(frame.image.astype(int) - picture(index)).mean() < 6
+        np.testing.assert_allclose(frame.intrinsics, [50 / 64, 52 / 48, 31 / 64, 25 / 48])
+
+
+def test_depth_beyond_the_tolerance_is_no_depth(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", late=30_000_000)
+    with pytest.raises(DataError, match=r"6 x image without depth at its stamp"):
+        open_kind("recording", path, {})
+    (sequence,), report = open_kind("recording", path, {"tolerance": 0.04})
+    assert len(sequence) == 6
+    assert not report.problems
+
+
+def test_frames_without_depth_are_counted_and_a_gap_in_time_is_a_cut(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", 9, without_depth=(1,), gap_before=5)
+    sequences, report = open_kind("recording", path, {})
+    assert [list(s.numbers) for s in sequences] == [[0, 2, 3, 4], [5, 6, 7, 8]]  # type: ignore[attr-defined]
+    assert "1 x image without depth at its stamp" in report.summary()
+    assert len(open_kind("recording", path, {"max_gap": 0.15})[0]) == 3
+    assert len(open_kind("recording", path, {"max_gap": 3.0})[0]) == 1
+
+
+def test_recording_without_intrinsics_can_be_told_them(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", info=False)
+    with pytest.raises(DataError, match=r"6 x image without usable CameraInfo \(or give `intrin"):
+        open_kind("recording", path, {})
+    (sequence,), _ = open_kind("recording", path, {"intrinsics": (50.0, 52.0, 30.5, 24.5)})
+    np.testing.assert_allclose(sequence.read(0).intrinsics[2:], [31 / 64, 25 / 48])
+
+
+def test_recording_without_depth_topic_or_of_nothing_is_refused(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", write_depth=None)
+    with pytest.raises(DataError, match="no depth topic to train on"):
+        open_kind("recording", path, {})
+    (tmp_path / "empty.mcap").touch()
+    with pytest.raises(DataError, match=r"empty\.mcap is empty"):
+        open_kind("recording", tmp_path / "empty.mcap", {})
+    with pytest.raises(DataError, match="no topic /no, expected one of"):
+        open_kind("recording", path, {"depth_topic": "/no"})
+
+
+def test_large_frames_are_shrunk_and_pictures_are_written_once(tmp_path: Path, cache: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap")
+    options = {"max_side": 32}
+    (sequence,), _ = open_kind("recording", path, options)
+    frame = sequence.read(2)
+    assert frame.image.shape == (24, 32, 3)
+    np.testing.assert_allclose(frame.intrinsics, [50 / 64, 52 / 48, 31 / 64, 25 / 48])
+    (folder,) = (cache / "recordings").iterdir()
+    before = {file.name: file.stat().st_mtime_ns for file in folder.iterdir()}
+    open_kind("recording", path, options)
+    assert before == {file.name: file.stat().st_mtime_ns for file in folder.iterdir()}
+    open_kind("recording", path, {})
+    assert len(list((cache / "recordings").iterdir())) == 2
+
+
+def test_a_truncated_recording_is_used_up_to_the_damage_and_says_so(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", 120)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    sequences, report = open_kind("recording", path, {})
+    assert 0 < sum(map(len, sequences)) < 120
+    assert "the rest is damaged or missing" in report.summary()
+
+
+def test_without_the_reading_libraries_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken:
+        name, value = "recording", "dyfn_ros.training_data:RECORDING"
+
+        def load(self) -> object:
+            raise ImportError("No module named 'rosbags'")
+
+    monkeypatch.setattr(datasets, "entry_points", lambda group: [Broken()])
+    datasets.data_kinds.cache_clear()
+    try:
+        with pytest.raises(DataError, match=r"No module named 'rosbags'; `pip install rosbags"):
+            data_kind("recording")
+        path = write_recording(tmp_path / "run.mcap", 2)
+        with pytest.raises(DataError, match=r"not available: recording \(dyfn_ros cannot be"):
+            open_pool((DataSpec(path),), "train")
+    finally:
+        datasets.data_kinds.cache_clear()
+
+
+TINY = {
+    "stages": [{"from_step": 0, "batch": 2, "sizes": [[32, 64]]}],
+    "steps": 2,
+    "threads": 1,
+    "log_every": 1,
+    "picture_every": 2,
+    "validate_every": 2,
+    "warmup_steps": 1,
+    "cache_draws": 2,
+    "cache_length": 4,
+    "strides": [1, 2],
+    "clips": 2,
+    "length": 3,
+    "decoded": 3,
+    "windows": [1],
+    "validation_clips": 1,
+}
+
+
+def test_fine_tuning_on_a_recording_changes_dyfn_alone(tmp_path: Path) -> None:
+    """`dyfn-train stabilizer --data recording.mcap --data folder`, with the default config."""
+    path = write_recording(tmp_path / "run.mcap", 8)
+    folder = tmp_path / "folder"
+    for index in range(8):
+        for name, pixels in (("rgb", picture(index)), ("depth", metres(index))):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+            values = pixels if name == "rgb" else np.nan_to_num(pixels * 1000).astype(np.uint16)
+            cv2.imwrite(str(folder / name / f"{index}.png"), values)
+    np.savetxt(folder / "K.txt", CAMERA)
+    settings = [
+        text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
+    ]
+    data = ["--data", str(path), "--data", str(folder)]
+    assert main(["stabilizer", *data, "--out", str(tmp_path / "out"), *settings]) == 0
+    before = load_model("dyfn-mini").state_dict()
+    after = load_model(tmp_path / "out" / "model.safetensors").state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith("stabilizer.") for name in changed)
+
+
+def test_recording_named_in_a_config_with_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", 8)
+    named = {"root": str(path), "kind": "recording", "depth_topik": DEPTH}
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump({**TINY, "base": "dyfn-mini", "data": [named]}))
+    assert main(["stabilizer", str(config), "--out", str(tmp_path / "out")]) == 1
+    assert (
+        "'depth_topik' of kind 'recording', did you mean 'depth_topic'" in capsys.readouterr().err
+    )
