@@ -35,8 +35,11 @@ class StatisticsControl(Stabilizer):
             raise ValueError(f"alpha must be in 0..1, got {alpha}")
         self.alpha = alpha
 
-    def remember(
-        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+        return mean
+
+    def recur(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         if state is not None and state.ema_mean is not None and state.ema_std is not None:
             mean = torch.lerp(state.ema_mean, mean, self.alpha)
@@ -109,7 +112,8 @@ def _score_sequence(
     }
     if model.stabilizer is not None:
         stabilizers["dyfn"] = model.stabilizer
-    scorers = {name: SequenceScorer() for name in (*CONTROLS, *stabilizers)}
+    scorers = {name: SequenceScorer() for name in CONTROLS}
+    scorers |= {name: SequenceScorer(quantity=model.quantity) for name in stabilizers}
     states: dict[str, StreamState | None] = dict.fromkeys(stabilizers)
     for image, truth in sequence():
         pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
@@ -117,8 +121,8 @@ def _score_sequence(
         for name, stabilizer in stabilizers.items():
             with stabilized_by(model, stabilizer):
                 changed, states[name] = model.stabilize_latent(latent, states[name])
-            depth = model.decode(changed).points[0, ..., 2].cpu().numpy()
-            scorers[name].push(to_shape(depth, truth.shape), truth)
+            values = model.decode(changed).values[0].cpu().numpy()
+            scorers[name].push(to_shape(values, truth.shape), truth)
         for name, control in CONTROLS.items():
             scorers[name].push(control((truth.shape[0], truth.shape[1])), truth)
     return {name: _variant_score(scorer) for name, scorer in scorers.items()}

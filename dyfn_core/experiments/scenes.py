@@ -54,7 +54,7 @@ def predicted_depth(
     for latent, truth in zip(scene.latents, scene.depth, strict=True):
         with stabilized_by(model, stabilizer):
             changed, state = model.stabilize_latent(latent, state)
-        depth = model.decode(changed).points[0, ..., 2].float().cpu().numpy()
+        depth = model.decode(changed).values[0].float().cpu().numpy()
         yield to_shape(depth, truth.shape)
 
 

@@ -57,7 +57,7 @@ def statistics_grid(
 
 
 def _depth(model: GeometryModel, latent: Latent) -> np.ndarray:
-    depth = model.decode(latent).points[..., 2].double().cpu().numpy()
+    depth = model.decode(latent).values.double().cpu().numpy()
     return np.asarray(depth).ravel()
 
 

@@ -52,7 +52,9 @@ class Objective:
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Objective:
         """From plain values, `levels` being mappings of LocalLevel's fields."""
-        plain = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
+        plain: dict[str, Any] = {
+            key: tuple(v) if isinstance(v, list) else v for key, v in values.items()
+        }
         if "levels" in plain:
             plain["levels"] = tuple(
                 level if isinstance(level, LocalLevel) else LocalLevel(**level)

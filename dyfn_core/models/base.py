@@ -48,6 +48,11 @@ class AffinePoints:
     points: Tensor
     mask: Tensor
 
+    @property
+    def values(self) -> Tensor:
+        """B x H x W: what an alignment compares with truth, here z."""
+        return self.points[..., 2]
+
     def entry(self, index: int) -> AffinePoints:
         """One image of the batch, as a batch of one."""
         return AffinePoints(self.points[index : index + 1], self.mask[index : index + 1])
@@ -61,6 +66,11 @@ class AffineDisparity:
     """
 
     disparity: Tensor
+
+    @property
+    def values(self) -> Tensor:
+        """B x H x W: what an alignment compares with (the inverse of) truth."""
+        return self.disparity
 
     def entry(self, index: int) -> AffineDisparity:
         """One image of the batch, as a batch of one."""
@@ -182,17 +192,12 @@ class GeometryModel(nn.Module, ABC):
         batch, single = image_to_batch(image, self.device)
         affine, state = self.predict_affine(batch, state, num_tokens, stabilize)
         if isinstance(affine, AffineDisparity):
-            height, width = affine.disparity.shape[-2:]
-            angle = NOMINAL_FOV if fov_x is None else fov_x
-            focal = focal_from_fov(angle, width / height, len(batch))
-            intrinsics = intrinsics_from_focal(focal, width / height).to(affine.disparity)
-            unit = median_disparity(affine.disparity)
-            prediction = from_disparity(affine.disparity, unit, intrinsics, state, apply_mask)
+            prediction = _of_disparity(affine.disparity, fov_x, state, apply_mask)
             return first_of_batch(prediction) if single else prediction
         valid = affine.mask > self.mask_threshold
         height, width = valid.shape[-2:]
-        focal = None if fov_x is None else focal_from_fov(fov_x, width / height, len(valid))
-        focal, shift = recover_focal_shift(affine.points, valid, focal)
+        known = None if fov_x is None else focal_from_fov(fov_x, width / height, len(valid))
+        focal, shift = recover_focal_shift(affine.points, valid, known)
         intrinsics = intrinsics_from_focal(focal, width / height).to(affine.points)
         shift = shift.to(affine.points)
         prediction = assemble(affine, valid, shift, intrinsics, state, force_projection, apply_mask)
@@ -246,6 +251,20 @@ def from_disparity(
         depth = torch.where(valid, depth, torch.inf)
         points = torch.where(valid[..., None], points, torch.inf)
     return Prediction(points, depth, valid, intrinsics, state, DISPARITY, disparity)
+
+
+def _of_disparity(
+    disparity: Tensor,
+    fov_x: float | Tensor | None,
+    state: StreamState | None,
+    apply_mask: bool,
+) -> Prediction:
+    """Every image in units of its own median."""
+    height, width = disparity.shape[-2:]
+    angle = NOMINAL_FOV if fov_x is None else fov_x
+    focal = focal_from_fov(angle, width / height, len(disparity))
+    intrinsics = intrinsics_from_focal(focal, width / height).to(disparity)
+    return from_disparity(disparity, median_disparity(disparity), intrinsics, state, apply_mask)
 
 
 def median_disparity(disparity: Tensor) -> Tensor:

@@ -173,7 +173,7 @@ class StabilizerTask(Task):
             if stabilized:
                 latent, state = self.model.stabilize_latent(latent, state)
             affine = self._decode(latent.features[:, None], latent.image_size, latent.network_size)
-            predicted.append(compared(affine)[0, 0].cpu().numpy())
+            predicted.append(affine.values[0, 0].cpu().numpy())
         true = [depth.float().numpy() for depth in sequence.depth]
         return sequence_scores(predicted, true, self.model.quantity)
 
@@ -231,11 +231,6 @@ class StabilizerTask(Task):
         )
         true = batch.depth[0, frames].float().cpu().numpy()
         return np.vstack([coloured_depth(np.hstack(list(row))) for row in (true, base, ours)])
-
-
-def compared(affine: AffinePoints | AffineDisparity) -> Tensor:
-    """What is compared with truth: z of the points, or disparity."""
-    return affine.disparity if isinstance(affine, AffineDisparity) else affine.points[..., 2]
 
 
 def far_is_large(affine: AffinePoints | AffineDisparity) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -33,7 +35,7 @@ def least_error(
     count, dims = x.shape
     terms, head = count * dims, 1 + sum(shifted)
     columns = head + terms * (1 if trunc is None else 2)
-    column_of_shift = {axis: 1 + i for i, axis in enumerate(np.flatnonzero(shifted))}
+    column_of_shift = {axis: 1 + i for i, axis in enumerate(np.flatnonzero(shifted).tolist())}
     rows, lower = [], []
     for i in range(count):
         for axis in range(dims):
@@ -162,9 +164,9 @@ def test_a_batch_is_solved_like_its_parts(trunc: float | None) -> None:
     x, y, w = (torch.cat(column) for column in zip(*parts, strict=True))
     w[3] = 0
     for solve in (
-        lambda *a: align_points(*a, "z", trunc),
-        lambda *a: align_points(*a, "xyz", trunc),
-        lambda *a: align_points_exact(*a, trunc),
+        partial(align_points, shift="z", trunc=trunc),
+        partial(align_points, shift="xyz", trunc=trunc),
+        partial(align_points_exact, trunc=trunc),
     ):
         scale, shift = solve(x, y, w)
         for i in range(5):

@@ -230,7 +230,7 @@ def test_objective_of_a_clip_without_truth_is_zero() -> None:
         total.backward()
         assert float(total.detach()) == 0
         assert points.grad is not None
-        assert not bool(points.grad.any())  # type: ignore[unreachable]
+        assert not bool(points.grad.any())
 
 
 def test_unknown_form_is_refused() -> None:

@@ -13,6 +13,7 @@ import json
 import re
 from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ def arrays(shared: Path) -> dict[str, np.ndarray]:
 
 
 @lru_cache(maxsize=1)
-def arguments(shared: Path) -> dict[str, dict]:  # type: ignore[type-arg]
+def arguments(shared: Path) -> dict[str, dict[str, Any]]:
     return json.loads((shared / "golden" / "losses_alignment.json").read_text())
 
 
