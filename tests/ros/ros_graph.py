@@ -35,7 +35,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 HERE = Path(__file__).parent
-DEADLINE = 90.0  # a busy machine imports torch slowly
+DEADLINE = 240.0  # a busy machine imports torch slowly
 NODE = "/stream_depth"
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 

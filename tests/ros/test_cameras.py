@@ -125,6 +125,14 @@ def alone(images: list[np.ndarray], matrix: np.ndarray | None = None) -> list[np
     return [torch.where(p.mask, p.depth, torch.nan).numpy() for p in predictions]
 
 
+def assert_close(got: np.ndarray, expected: np.ndarray) -> None:
+    """Equal but for the last bits, which a batch changes, also on which side of the mask's edge."""
+    both = ~np.isnan(got) & ~np.isnan(expected)
+    assert (np.isnan(got) != np.isnan(expected)).mean() < 0.005
+    assert both.mean() > 0.3
+    np.testing.assert_allclose(got[both], expected[both], rtol=1e-4)
+
+
 def as_depth(data: bytes, height: int = 36, width: int = 48) -> np.ndarray:
     return np.frombuffer(data, "<f4").reshape(height, width)
 
@@ -139,7 +147,7 @@ def test_each_camera_has_a_stream_of_its_own(rig: Rig) -> None:
     for camera in BOTH:
         for stamp, expected in zip(stamps[camera], alone(images[camera]), strict=True):
             got = as_depth(rig.depth(camera, stamp))
-            np.testing.assert_allclose(got, expected, rtol=1e-5)
+            assert_close(got, expected)
 
 
 def test_without_batches_a_camera_gets_the_very_bytes_it_gets_alone(rig: Rig) -> None:
@@ -164,7 +172,7 @@ def test_a_camera_that_fails_or_is_bad_costs_the_other_nothing(rig: Rig) -> None
         rig.send("left", failing)
         stamps.append(rig.send("front", image))
     for stamp, expected in zip(stamps, alone(good), strict=True):
-        np.testing.assert_allclose(as_depth(rig.depth("front", stamp)), expected, rtol=1e-5)
+        assert_close(as_depth(rig.depth("front", stamp)), expected)
     stamp = rig.send("left", frames(1)[0])
     assert rig.reset_at("left", stamp)[0] == "inference failed"
 
@@ -340,7 +348,7 @@ def test_a_distorted_lens_is_undone_or_refused(rig: Rig) -> None:
     view = Calibrator(print).view(image, "optical", info, CalibrationRules())
     assert view.visible is not None
     expected = np.where(view.visible, alone([view.image], matrix)[0], np.nan)
-    np.testing.assert_allclose(got, expected, rtol=1e-5)
+    assert_close(got, expected)
 
     assert rig.probe.set("distortion", "refuse").successful
     rig.send("front", image)
@@ -348,7 +356,7 @@ def test_a_distorted_lens_is_undone_or_refused(rig: Rig) -> None:
     assert rig.probe.set("distortion", "ignore").successful
     rig.reset()
     got = as_depth(rig.play("front", [image])[0])
-    np.testing.assert_allclose(got, alone([image], matrix)[0], rtol=1e-5)
+    assert_close(got, alone([image], matrix)[0])
     assert rig.probe.set("distortion", "undistort").successful
 
 
@@ -363,4 +371,4 @@ def test_a_camera_info_of_another_frame_is_not_used(rig: Rig) -> None:
     rig.probe.wait(warned)
     rig.reset()
     expected = alone(frames(1))[0]
-    np.testing.assert_allclose(as_depth(rig.play("left", frames(1))[0]), expected, rtol=1e-5)
+    assert_close(as_depth(rig.play("left", frames(1))[0]), expected)

@@ -58,7 +58,7 @@ class TinyModel(GeometryModel):
             indexing="ij",
         )
         points = torch.stack([u * z, v * z, z], dim=-1)
-        return AffinePoints(points, raw[:, 1] - raw[:, 1].mean() + 0.9)
+        return AffinePoints(points, raw[:, 1] - raw[:, 1].mean((1, 2), keepdim=True) + 0.9)
 
 
 def wait_for_go() -> None:

@@ -1,0 +1,125 @@
+"""Memory and latency of the node over many frames: flat and stable, or not.
+
+    python benchmarks/soak.py [--frames 20000] [--size 64x48] [--model dyfn-mini] [--out soak.json]
+
+Frames go over DDS one at a time, with subscribers on depth and cloud. Resident memory and latency
+are taken in ten stretches; between two of them the stream is reset or the images change their size
+(half, or back). Exit code 1 when memory grows by more than --grow MB from the second stretch to
+the last, or the median latency of the last stretch is more than 1.5 times that of the first one of
+its size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cameras import Feeder
+
+from dyfn_ros.environment import prepare_environment
+from dyfn_ros.node_process import NodeProcess
+
+STRETCHES = 10
+
+
+def resident(pid: int) -> float:
+    """Megabytes."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    line = next(line for line in status.splitlines() if line.startswith("VmRSS"))
+    return int(line.split()[1]) / 1024
+
+
+def stretch(feeder: Feeder, process: NodeProcess, frames: int) -> dict[str, float]:
+    """So many frames of the one camera."""
+    first, last = feeder.count["camera"], time.monotonic()
+    feeder.latency.clear()
+    seen = first
+    while feeder.count["camera"] - first < frames:
+        feeder.spin()
+        if feeder.count["camera"] != seen:
+            seen, last = feeder.count["camera"], time.monotonic()
+        elif time.monotonic() - last > 30:
+            process.check()
+            raise TimeoutError(f"no frame came back for 30 s after {seen} frames")
+    return {
+        "frames": feeder.count["camera"],
+        "resident_mb": resident(process.pid),
+        "latency_p50_ms": statistics.median(feeder.latency) * 1e3,
+        "latency_p99_ms": float(np.quantile(feeder.latency, 0.99)) * 1e3,
+    }
+
+
+def soak(options: argparse.Namespace) -> list[dict[str, float]]:
+    """One row per stretch."""
+    import rclpy
+
+    width, height = (int(part) for part in options.size.split("x"))
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(8)]
+    parameters: dict[str, Any] = {
+        "model": options.model,
+        "cameras": "[camera]",
+        "threads": options.threads,
+    }
+    if options.num_tokens:
+        parameters["num_tokens"] = options.num_tokens
+    namespace = f"/soak_{os.getpid()}"
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        NodeProcess(Path(folder) / "node.log", parameters, namespace) as process,
+    ):
+        rclpy.init()
+        feeder = Feeder(["camera"], images, namespace)
+        try:
+            feeder.prime(process)
+            rows = []
+            for index in range(STRETCHES):
+                rows.append(stretch(feeder, process, options.frames // STRETCHES))
+                print(
+                    f"{rows[-1]['frames']:7.0f} frames  {rows[-1]['resident_mb']:7.1f} MB  "
+                    f"p50 {rows[-1]['latency_p50_ms']:6.1f} ms  "
+                    f"p99 {rows[-1]['latency_p99_ms']:6.1f} ms",
+                    flush=True,
+                )
+                if index % 2:
+                    feeder.resize()
+                else:
+                    feeder.reset()
+            return rows
+        finally:
+            feeder.close()
+            rclpy.try_shutdown()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--model", default="dyfn-mini")
+    parser.add_argument("--frames", type=int, default=20_000)
+    parser.add_argument("--size", default="64x48")
+    parser.add_argument("--num-tokens", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--grow", type=float, default=20.0)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    prepare_environment()
+    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    rows = soak(options)
+    if options.out:
+        options.out.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    grown = rows[-1]["resident_mb"] - rows[1]["resident_mb"]
+    slower = rows[-1]["latency_p50_ms"] / rows[1]["latency_p50_ms"]  # both of the first size
+    print(f"memory grew by {grown:.1f} MB, the median latency to {slower:.2f} times what it was")
+    return 1 if grown > options.grow or slower > 1.5 else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
