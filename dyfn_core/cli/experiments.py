@@ -21,7 +21,7 @@ from dyfn_core.experiments.report import (
     write_section,
 )
 from dyfn_core.experiments.runner import Plan, Runner, encode_all
-from dyfn_core.experiments.scenes import Scene, predicted_depth, scores_by_length
+from dyfn_core.experiments.scenes import Scene, predictions, scores_by_length
 from dyfn_core.experiments.statistics_grid import draw_grid, statistics_grid
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
@@ -132,7 +132,7 @@ def _curve(
 ) -> dict[int, float]:
     """Number of frames -> mean over the scenes that have so many."""
     curves = [
-        scores_by_length(scene, predicted_depth(model, scene, stabilizer), lengths)
+        scores_by_length(scene, predictions(model, scene, stabilizer), lengths, model.quantity)
         for scene in scenes
     ]
     reached = sorted({length for curve in curves for length in curve})

@@ -17,7 +17,7 @@ from dyfn_core.evaluation.controls import (
 from dyfn_core.evaluation.protocols import CONTROLS, SequenceScorer, to_shape
 from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.stabilizer import Stabilizer
-from dyfn_core.prediction import StreamState
+from dyfn_core.prediction import DEPTH, StreamState
 
 METRICS = tuple(field.name for field in fields(VariantScore))
 BASE_ROWS = ("ramp", "constant", "base", "ema", "frozen")
@@ -46,10 +46,10 @@ def encode_scene(
 
 
 @torch.inference_mode()
-def predicted_depth(
+def predictions(
     model: GeometryModel, scene: Scene, stabilizer: Stabilizer | None
 ) -> Iterator[np.ndarray]:
-    """Affine depth of each frame, at the size of its truth, with this stabilizer or none."""
+    """Affine depth (or disparity) of each frame, at the size of its truth, so stabilized."""
     state: StreamState | None = None
     for latent, truth in zip(scene.latents, scene.depth, strict=True):
         with stabilized_by(model, stabilizer):
@@ -62,7 +62,7 @@ def score_stabilizer(
     model: GeometryModel, scenes: Sequence[Scene], stabilizer: Stabilizer | None
 ) -> VariantScore:
     """Mean over the scenes of AbsRel and delta1 under the image and video protocols."""
-    return _mean([_score(scene, predicted_depth(model, scene, stabilizer)) for scene in scenes])
+    return _mean([_score(s, predictions(model, s, stabilizer), model.quantity) for s in scenes])
 
 
 def score_controls(model: GeometryModel, scenes: Sequence[Scene]) -> dict[str, VariantScore]:
@@ -79,10 +79,10 @@ def score_controls(model: GeometryModel, scenes: Sequence[Scene]) -> dict[str, V
 
 
 def scores_by_length(
-    scene: Scene, predicted: Iterable[np.ndarray], lengths: Sequence[int]
+    scene: Scene, predicted: Iterable[np.ndarray], lengths: Sequence[int], quantity: str = DEPTH
 ) -> dict[int, float]:
     """Video AbsRel of the first n frames, aligned anew for each n that the scene reaches."""
-    scorer, found = SequenceScorer(), {}
+    scorer, found = SequenceScorer(quantity=quantity), {}
     for count, (depth, truth) in enumerate(zip(predicted, scene.depth, strict=True), 1):
         scorer.push(depth, truth)
         if count in lengths:
@@ -92,8 +92,8 @@ def scores_by_length(
     return found
 
 
-def _score(scene: Scene, predicted: Iterable[np.ndarray]) -> VariantScore:
-    scorer = SequenceScorer()
+def _score(scene: Scene, predicted: Iterable[np.ndarray], quantity: str = DEPTH) -> VariantScore:
+    scorer = SequenceScorer(quantity=quantity)
     for depth, truth in zip(predicted, scene.depth, strict=True):
         scorer.push(depth, truth)
     image, video = scorer.image(), scorer.video()

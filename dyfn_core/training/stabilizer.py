@@ -148,8 +148,9 @@ class StabilizerTask(Task):
         affine = self.model.decode(Latent(latents.flatten(0, 1), half, network_size))
         shape = latents.shape[:2]
         if isinstance(affine, AffineDisparity):
-            return AffineDisparity(affine.disparity.unflatten(0, shape))
-        return AffinePoints(affine.points.unflatten(0, shape), affine.mask.unflatten(0, shape))
+            return AffineDisparity(affine.disparity.float().unflatten(0, shape))
+        points, mask = affine.points.float(), affine.mask.float()
+        return AffinePoints(points.unflatten(0, shape), mask.unflatten(0, shape))
 
     def validate(self) -> dict[str, float]:
         """Image and video AbsRel with and without DyFN; `score` is the rendered video's."""
@@ -244,10 +245,11 @@ def unroll(model: GeometryModel, clips: LatentClips) -> list[Latent]:
     """The clips' T stabilized latents, the state passed along."""
     state: StreamState | None = None
     outputs = []
-    for features in clips.latent.float().unbind(1):
-        latent = Latent(features, clips.image_size, clips.network_size)
-        latent, state = model.stabilize_latent(latent, state)
-        outputs.append(latent)
+    with full_precision(clips.latent):  # statistics and the recurrence need it
+        for features in clips.latent.float().unbind(1):
+            latent = Latent(features, clips.image_size, clips.network_size)
+            latent, state = model.stabilize_latent(latent, state)
+            outputs.append(latent)
     return outputs
 
 
