@@ -9,7 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from dyfn_core.evaluation.controls import score_variants
 from dyfn_core.evaluation.protocols import SequenceScorer
+from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.checkpoints import (
     CheckpointError,
     build_model,
@@ -200,3 +202,38 @@ def test_disparity_is_scored_in_disparity_space() -> None:
 def test_unknown_quantity_is_refused() -> None:
     with pytest.raises(ValueError, match="'inverse'"):
         SequenceScorer(quantity="inverse")
+
+
+def test_a_whole_evaluation_aligns_disparity_and_draws_depth() -> None:
+    depth = np.linspace(1, 9, 4000).reshape(50, 80).astype(np.float32)
+    image = np.zeros((50, 80, 3), np.uint8)
+    evaluation = SequenceEvaluation(3, quantity="disparity")
+    for index in range(3):
+        disparity = (3 / depth + 0.5).astype(np.float32)
+        valid = np.ones(depth.shape, bool)
+        evaluation.push(image, disparity, valid, depth, stamp=float(index), latency=0.01)
+    results = evaluation.results()
+    assert results["image"]["abs_rel"] < 1e-4
+    assert results["video"]["abs_rel"] < 1e-4
+    # The ramp falls from top to bottom, where this depth grows: a control stays a depth.
+    assert results["controls"]["constant"]["video"]["abs_rel"] > 0.1
+    exact = SequenceEvaluation(3)
+    for index in range(3):
+        exact.push(image, depth, np.ones(depth.shape, bool), depth, stamp=index, latency=0.01)
+    apart = evaluation.draw_strip().astype(int) - exact.draw_strip().astype(int)
+    assert np.abs(apart).max() <= 2
+
+
+@torch.inference_mode()
+def test_controls_score_a_disparity_model_as_disparity(untrained: DepthAnythingModel) -> None:
+    """Truth made of the model's own disparity: the base has no error, the scene's flat one has."""
+    images = frames(2)
+    truths = []
+    for image in images:
+        disparity = untrained.infer(image).disparity
+        assert disparity is not None
+        truths.append((1 / (2 * disparity + 0.1)).numpy())
+    scores = score_variants(untrained, [lambda: zip(images, truths, strict=True)])
+    assert scores["base"].video_abs_rel < 1e-3
+    assert scores["base"].image_abs_rel < 1e-3
+    assert scores["frozen"].video_abs_rel > 1e-3
