@@ -29,7 +29,10 @@ def _row(name: str, spec: Spec) -> str:
 
 
 def _text(spec: Spec) -> str:
-    limits = f" From {spec.range[0]:g} to {spec.range[1]:g}." if spec.range else ""
+    limits = ""
+    if spec.range:
+        low, high = (f"{end:.10g}" for end in spec.range)
+        limits = f" From {low} to {high}."
     return f"{spec.description}{limits}"
 
 

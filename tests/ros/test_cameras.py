@@ -97,15 +97,22 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     with own_domain() as environment:
         node = tiny_node(environment, tmp_path_factory.mktemp("node"), **parameters)
         probe = Probe(environment)
-        rig = Rig(node, probe)
-        for camera in BOTH:
-            while not probe.received[f"{camera}/depth/image"]:
-                rig.send(camera, frames(1)[0])
-                probe.executor.spin_once(timeout_sec=0.05)
-            rig.play(camera, frames(1))
-        yield rig
-        probe.close()
-        assert node.end() == 0, node.log
+        try:
+            yield primed(Rig(node, probe))
+            assert node.end() == 0, node.log
+        finally:
+            probe.close()
+            node.kill()
+
+
+def primed(rig: Rig) -> Rig:
+    """Both cameras' frames come back, and none is under way."""
+    for camera in BOTH:
+        while not rig.probe.received[f"{camera}/depth/image"]:
+            rig.send(camera, frames(1)[0])
+            rig.probe.executor.spin_once(timeout_sec=0.05)
+        rig.play(camera, frames(1))
+    return rig
 
 
 @pytest.fixture
