@@ -19,10 +19,12 @@ from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
     RunConfig,
+    ScaleRunConfig,
     StabilizerRunConfig,
     read_config,
 )
 from dyfn_core.training.processes import Processes
+from dyfn_core.training.scale import ScaleTask
 from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
 from dyfn_core.training.stabilizer import StabilizerTask
 from dyfn_core.training.trainer import InterruptedRunError, Task, Trainer, TrainingError
@@ -64,6 +66,11 @@ def _trainer(options: argparse.Namespace) -> Trainer:
             raise ConfigError("base: give a config; there is no default one")
         config = base = read_config(options.config, BaseRunConfig, overrides)
         make: Callable[..., Task] = partial(BaseTask, base)
+    elif options.command == "scale":
+        if options.config is None:
+            raise ConfigError("scale: give a config; there is no default one")
+        config = scale = read_config(options.config, ScaleRunConfig, overrides)
+        make = partial(ScaleTask, scale, options.out / "summaries")
     else:
         if options.config is None and not options.data:
             raise ConfigError("stabilizer: give a config, or --data to fine-tune on")
@@ -123,6 +130,7 @@ def _parser() -> argparse.ArgumentParser:
     purposes = {
         "base": "train encoder and head on rendered frames",
         "stabilizer": "train DyFN on rendered clips, everything else frozen",
+        "scale": "teach DyFN's recurrence the base's errors of scale, without decoding",
     }
     for name, purpose in purposes.items():
         command = commands.add_parser(name, help=purpose, description=purpose)

@@ -29,12 +29,16 @@ class StabilizerConfig:
     form: "paper": F' = sigma_t * F_norm + mu_t, statistics replaced by predicted ones;
         "residual": F' = sigma_F * exp(dg) * F_norm + (mu_F + sigma_F * db), statistics corrected,
         the identity before training.
+    standardize: the recurrence sees every channel less its usual mean, over its usual deviation:
+        constants of the checkpoint, zero and one until training sets them. For latents whose
+        channels sit at very different levels.
     """
 
     kind: str = "convgru"
     hidden: int = 256
     pool: int = 1
     form: str = "paper"
+    standardize: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -65,6 +69,9 @@ class Stabilizer(nn.Module, ABC):
         super().__init__()
         self.channels = channels
         self.config = config
+        if config.standardize:
+            self.register_buffer("usual_mean", torch.zeros(channels))
+            self.register_buffer("usual_std", torch.ones(channels))
 
     def forward(self, features: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
         """features B x C x h x w, previous state -> stabilized features, next state.
@@ -98,11 +105,29 @@ class Stabilizer(nn.Module, ABC):
         gamma, beta, state = self.remember(features, mean, std, state)
         return gamma, beta, mean, std, state
 
-    @abstractmethod
     def remember(
         self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         """One step of the recurrence -> gamma, beta (B x C), next state."""
+        return self.recur(self.summarise(features, mean), mean, std, state)
+
+    @abstractmethod
+    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+        """What the recurrence sees of a latent: B x C, or B x C x h' x w'."""
+
+    @abstractmethod
+    def recur(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        """As remember, from a summary; the residual form has no use for mean and std."""
+
+    def standardized(self, summary: Tensor) -> Tensor:
+        """The summary in units of its usual values, when the config asks for that."""
+        if not self.config.standardize:
+            return summary
+        mean, std = self.get_buffer("usual_mean"), self.get_buffer("usual_std")
+        shape = (1, -1) + (1,) * (summary.dim() - 2)
+        return (summary - mean.view(shape)) / std.view(shape)
 
     def _previous(self, shape: tuple[int, ...], state: StreamState | None, like: Tensor) -> Tensor:
         if state is None:
@@ -144,10 +169,10 @@ class ConvGRUStabilizer(Stabilizer):
         nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
         nn.init.zeros_(self.beta_head.bias)  # type: ignore[arg-type]
 
-    def remember(
-        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    def recur(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
-        x = self._pooled(features)
+        x = self.standardized(summary)
         shape = (x.shape[0], self.config.hidden, x.shape[2], x.shape[3])
         hidden = self.conv_gru_cell(x, self._previous(shape, state, x))
         average = hidden.mean(dim=(-2, -1), keepdim=True)
@@ -160,7 +185,7 @@ class ConvGRUStabilizer(Stabilizer):
             gamma = F.softplus(self.gamma_head(hidden)).mean(dim=(-2, -1))
         return gamma, beta, StreamState(hidden)
 
-    def _pooled(self, features: Tensor) -> Tensor:
+    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
         pool = self.config.pool
         if pool == 1:
             return features
@@ -184,11 +209,15 @@ class GRUStabilizer(Stabilizer):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)
 
-    def remember(
-        self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+        return mean
+
+    def recur(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
-        shape = (features.shape[0], self.config.hidden)
-        hidden = self.gru_cell(mean, self._previous(shape, state, mean))
+        x = self.standardized(summary)
+        shape = (x.shape[0], self.config.hidden)
+        hidden = self.gru_cell(x, self._previous(shape, state, x))
         gamma, beta = self.gamma_delta_head(hidden), self.beta_delta_head(hidden)
         if self.config.form == "residual":
             return gamma, beta, StreamState(hidden)

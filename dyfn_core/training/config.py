@@ -255,6 +255,26 @@ class StabilizerRunConfig(RunConfig):
         }
 
 
+class ScaleRunConfig(StabilizerRunConfig):
+    """`dyfn-train scale`: DyFN's recurrence from the scale errors of the base's own frames.
+
+    summary_draws: clips of `cache_length` frames that are summarised, once, in `cache`; a clip of
+    training is `length` of its frames, sub_strides apart. size_weight, change_weight: of the
+    errors' and the corrections' size beside the errors' spread. noise: added to the summaries,
+    in units of their deviation.
+    """
+
+    cache_draws: int = Field(0, ge=0, le=0)
+    summary_draws: int = Field(400, ge=1)
+    cache_length: int = Field(48, ge=2)
+    strides: tuple[int, int] = (1, 1)
+    sub_strides: tuple[int, int] = (1, 3)
+    clips: int = Field(12, ge=1)
+    size_weight: float = Field(0.2, ge=0)
+    change_weight: float = Field(0.02, ge=0)
+    noise: float = Field(0.15, ge=0)
+
+
 def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Settings:
     """The settings in a YAML file with `key=value` (or `key.sub=value`) overrides on top.
 

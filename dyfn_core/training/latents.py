@@ -62,7 +62,7 @@ class LatentCache:
     def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
         self.folder, self.source, self.draws = folder, source, draws
         folder.mkdir(parents=True, exist_ok=True)
-        self._check(_fingerprint(model, source))
+        self._check(fingerprint(model, source))
         self._build(model)
         self.entries = [self._load(index) for index in range(draws)]
 
@@ -141,7 +141,8 @@ def _sub_clip(
     return entry.latent[clip, index], entry.depth[clip, index], entry.intrinsics[clip, index]
 
 
-def _fingerprint(model: GeometryModel, source: ClipSource) -> dict[str, Any]:
+def fingerprint(model: GeometryModel, source: ClipSource) -> dict[str, Any]:
+    """What a cache depends on: the frozen parameters, and where its clips come from."""
     digest = hashlib.sha256()
     for name, value in model.state_dict().items():
         if not name.startswith("stabilizer."):

@@ -1,0 +1,164 @@
+"""What DyFN's recurrence needs of a clip, and no more: summaries of latents, errors of scale.
+
+With a frozen base, everything that decides a frame's scale is known before DyFN runs: the latent,
+the scale error of the base's own depth, and how that error moves with the latent's statistics. A
+clip shrinks from megabytes to kilobytes a frame, and a step of training needs no decoder.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rich.progress import track
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
+from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent
+from dyfn_core.training.config import ConfigError
+from dyfn_core.training.latents import META, encode_clips, fingerprint
+
+FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
+
+
+@dataclass(frozen=True)
+class SummaryClips:
+    """B clips of T frames. summary: B x T x C (x h x w) float16, as Stabilizer.summarise gives it.
+    error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any."""
+
+    summary: Tensor
+    error: Tensor
+
+
+class SummaryCache:
+    """`draws` clips in a folder, made once and kept in memory; interrupted builds go on.
+
+    slope: 2C, the mean derivative of a frame's error by DyFN's residual gamma and beta. Raises
+    ConfigError when the folder was made with another model or source.
+    """
+
+    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
+        self.folder, self.source, self.draws = folder, source, draws
+        folder.mkdir(parents=True, exist_ok=True)
+        self._check(model)
+        self._build(model)
+        parts = [load_file(self._path(index)) for index in range(draws)]
+        self.summary = torch.cat([part["summary"] for part in parts])
+        self.error = torch.cat([part["error"] for part in parts])
+        self.slope = torch.stack([part["slope"] for part in parts]).mean(0)
+
+    def usual(self) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of every channel over all clips."""
+        channels = self.summary.transpose(0, 2).flatten(1).float()
+        return channels.mean(1), channels.std(1).clamp(min=1e-6)
+
+    def batches(
+        self, start: int, seed: int, clips: int, length: int, strides: tuple[int, int]
+    ) -> Iterator[SummaryClips]:
+        """Endless batches: `length` frames, strides[0]..strides[1] apart, also backwards."""
+        step = start
+        frames = self.summary.shape[1]
+        longest = min(strides[1], (frames - 1) // (length - 1))
+        while True:
+            draw = torch.Generator().manual_seed(seed * 1_000_003 + step)
+            chosen = [self._sub_clip(length, (strides[0], longest), draw) for _ in range(clips)]
+            summary, error = (torch.stack(parts) for parts in zip(*chosen, strict=True))
+            yield SummaryClips(summary, error)
+            step += 1
+
+    def _sub_clip(
+        self, length: int, strides: tuple[int, int], draw: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        def below(limit: int) -> int:
+            return int(torch.randint(limit, (1,), generator=draw))
+
+        clip, frames = below(len(self.summary)), self.summary.shape[1]
+        stride = strides[0] + below(strides[1] - strides[0] + 1)
+        index = below(frames - (length - 1) * stride) + stride * torch.arange(length)
+        if below(2):
+            index = index.flip(0)
+        return self.summary[clip, index], self.error[clip, index]
+
+    def _check(self, model: GeometryModel) -> None:
+        assert model.stabilizer is not None
+        wanted = fingerprint(model, self.source)
+        wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
+        path = self.folder / META
+        if not path.exists():
+            path.write_text(json.dumps(wanted, indent=1))
+        found = json.loads(path.read_text())
+        other = sorted(key for key in wanted if found.get(key) != wanted[key])
+        if other:
+            raise ConfigError(
+                f"{self.folder} holds summaries made with another {', '.join(other)}: "
+                "delete it or give another `cache`"
+            )
+
+    def _build(self, model: GeometryModel) -> None:
+        missing = [index for index in range(self.draws) if not self._path(index).exists()]
+        if not missing:
+            return
+        batches = batch_loader(self.source, missing[0])
+        for index in track(range(missing[0], self.draws), description="summarising clips"):
+            parts = summarise_clips(model, next(batches))
+            partial = self._path(index).with_suffix(".partial")
+            save_file(parts, partial)
+            partial.replace(self._path(index))
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:05d}.safetensors"
+
+
+def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
+    """summary B x T x C (x h x w) float16, error B x T, slope 2C of the clips' first frames."""
+    stabilizer = model.stabilizer
+    assert stabilizer is not None
+    clips = encode_clips(model, batch)
+    aspect = clips.image_size[1] / clips.image_size[0]
+    half = (clips.image_size[0] // 2, clips.image_size[1] // 2)
+    summaries, errors, slopes = [], [], []
+    for latent, depth, intrinsics in zip(
+        clips.latent.float(), clips.depth.float(), batch.intrinsics, strict=True
+    ):
+        with torch.no_grad():
+            summaries.append(stabilizer.summarise(latent, latent.mean((-2, -1))).half())
+            level = mean_log_z(model, Latent(latent, half, clips.network_size), depth)
+        focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / (aspect**2 + 1) ** 0.5
+        valid = torch.isfinite(depth) & (depth > 0)
+        truth = torch.where(valid, depth, 1.0).log().sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
+        seen = valid.sum((1, 2)) >= FEWEST_PIXELS
+        errors.append(torch.where(seen, level - truth + focal.log(), torch.nan))
+        slopes.append(scale_slope(model, Latent(latent[:1], half, clips.network_size), depth[:1]))
+    return {
+        "summary": torch.stack(summaries).contiguous(),
+        "error": torch.stack(errors),
+        "slope": torch.stack(slopes).mean(0),
+    }
+
+
+def mean_log_z(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
+    """B: mean of log z over the pixels where depth (B x h x w) is valid, else over all."""
+    affine = model.decode(latent)
+    if isinstance(affine, AffineDisparity):
+        raise ConfigError("the scale of a base of disparity is not a scale of depth")
+    log_z = affine.points[..., 2].clamp(min=1e-6).log()
+    valid = torch.isfinite(depth) & (depth > 0)
+    valid = valid | (valid.sum((1, 2), keepdim=True) == 0)
+    return torch.where(valid, log_z, 0.0).sum((1, 2)) / valid.sum((1, 2))
+
+
+def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
+    """2C: derivative of mean_log_z by the residual gamma and beta, at zero, mean over frames."""
+    features = latent.features
+    std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
+    change = features.new_zeros(2, features.shape[1], requires_grad=True)
+    gamma, beta = change[0].view(1, -1, 1, 1), change[1].view(1, -1, 1, 1)
+    with torch.enable_grad():
+        moved = gamma.exp() * (features - mean) + mean + std * beta
+        level = mean_log_z(model, Latent(moved, latent.image_size, latent.network_size), depth)
+        (slope,) = torch.autograd.grad(level.mean(), change)
+    return slope.flatten()
