@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import cv2
 import numpy as np
 import torch
 
-from dyfn_core.data.frames import FrameSequence
+from dyfn_core.data.frames import FrameError, FrameSequence
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.models.base import AffineDisparity, GeometryModel
 from dyfn_core.prediction import DEPTH, DISPARITY
 
+logger = logging.getLogger(__name__)
 SHORT_SIDE = 240  # frames are shrunk to this before they are encoded
 
 
@@ -26,11 +28,24 @@ class Example:
 
 
 def spread_examples(sequences: list[FrameSequence], count: int) -> list[Example]:
-    """`count` frames, evenly spread over all the frames of the sequences."""
+    """`count` frames, evenly spread over all the frames of the sequences.
+
+    Unreadable ones are left out with a warning; FrameError when none is readable.
+    """
     places = [(sequence, index) for sequence in sequences for index in range(len(sequence))]
     chosen = np.unique(np.linspace(0, len(places) - 1, min(count, len(places))).round().astype(int))
-    frames = [places[place][0].read(places[place][1]) for place in chosen]
-    return [_small(frame.image, frame.depth) for frame in frames]
+    examples, problem = [], FrameError("there are no frames to validate on")
+    for sequence, index in (places[place] for place in chosen):
+        try:
+            frame = sequence.read(index)
+        except FrameError as error:
+            logger.warning("not validated on: %s", error)
+            problem = error
+        else:
+            examples.append(_small(frame.image, frame.depth))
+    if not examples:
+        raise problem
+    return examples
 
 
 def recording_examples(folder: Path, every: int = 20) -> list[Example]:

@@ -9,7 +9,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from made_data_sets import FLOOR, View, make_point_odyssey, view, write_jpeg, write_png
+from made_data_sets import (
+    BALL,
+    FLOOR,
+    RADIUS,
+    View,
+    make_point_odyssey,
+    view,
+    write_jpeg,
+    write_png,
+)
 from made_frames import write_data_set
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +27,7 @@ from dyfn_core.data.datasets import open_kind, recognise
 from dyfn_core.data.frames import DataError, FrameError, NumberedSequence, RgbdFrame
 from dyfn_core.data.pool import DataPool, DataSpec, cut_sequences, open_pool
 from dyfn_core.training.config import BaseRunConfig, ConfigError, read_config
+from dyfn_core.training.validation import spread_examples
 
 SIZE = (48, 64)
 CAMERA = (50.0, 52.0, 31.0, 25.0)  # the first pixel's corner at 0
@@ -190,7 +200,7 @@ def test_clip_knows_its_masks_points_and_poses_under_one_augmentation() -> None:
     """Cropped, mirrored and resized, the floor's points are still on the floor."""
     source = clip_source(3, (1, 1))
     sky = 0
-    for seed in range(6):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         clip = draw_clip(source, made_sequence("a", [0, 1, 2]), (32, 64), rng)
         assert clip.name == "a"
@@ -204,8 +214,11 @@ def test_clip_knows_its_masks_points_and_poses_under_one_augmentation() -> None:
             turn, move = clip.poses[index, :3, :3], clip.poses[index, :3, 3]
             assert np.linalg.det(turn) == pytest.approx(1)
             world = points[index][clip.valid[index]] @ turn.T + move
-            bottom = world[-64:]  # the lowest rows see the floor, or the ball above it
-            assert np.median(np.abs(bottom[:, 1] - FLOOR)) < 0.06
+            on_floor = np.abs(world[:, 1] - FLOOR)
+            balls = [np.linalg.norm(world - BALL * [side, 1, 1], axis=-1) for side in (1, -1)]
+            error = np.minimum(on_floor, np.abs(np.min(balls, 0) - RADIUS))
+            distance = np.linalg.norm(points[index][clip.valid[index]], axis=-1)
+            assert np.quantile(error / distance, 0.99) < 0.011  # half a pixel
     assert sky > 0
 
 
@@ -301,3 +314,10 @@ def test_a_path_of_no_known_kind_says_what_would_be(tmp_path: Path) -> None:
     (tmp_path / "holiday.txt").touch()
     with pytest.raises(DataError, match=r"rgbd_folder \(.*found holiday.txt"):
         open_pool((DataSpec(tmp_path),), "train")
+
+
+def test_unreadable_frames_are_left_out_of_validation() -> None:
+    good, bad = made_sequence("good", [0, 1]), made_sequence("bad", [0, 1], broken=(0, 1))
+    assert len(spread_examples([good, bad], 4)) == 2
+    with pytest.raises(FrameError, match=r"bad/1.png: damaged"):
+        spread_examples([bad], 4)
