@@ -17,13 +17,11 @@ WORLDS = [
     'embreex>=2.17; platform_machine == "x86_64"',
     "pillow>=9",
 ]
+TEST = ["pytest>=8", "pytest-timeout>=2", "hypothesis>=6", "scipy>=1.11"]  # `colcon test` asks
 DEV = [
-    "pytest>=8",
-    "pytest-timeout>=2",
-    "hypothesis>=6",
+    *TEST,
     "ruff>=0.6",
     "mypy>=1.10",
-    "scipy>=1.11",
     "types-PyYAML",
     "colcon-common-extensions",
     "colcon-ros",
@@ -71,6 +69,7 @@ setup(
         "train": TRAIN,
         "datasets": DATASETS,
         "worlds": WORLDS,
+        "test": TEST,
         "dev": DEV,
         "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *DEV],
     },

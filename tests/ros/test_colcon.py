@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from dyfn_core.models import save_model
 from dyfn_core.models.mini import MiniConfig, MiniModel
 
 ROOT = Path(__file__).parents[2]
+TESTS = ("tests/ros/test_encodings.py", "tests/ros/test_compressed_depth.py")
 PARTS = ("dyfn_core", "dyfn_ros", "resource", "launch", "config")
 FILES = ("package.xml", "setup.py", "setup.cfg", "LICENSE", "README.md")
 
@@ -28,6 +30,9 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heavy = shutil.ignore_patterns("__pycache__", "*.safetensors")
     for name in PARTS:
         shutil.copytree(ROOT / name, source / name, ignore=heavy)
+    for name in TESTS:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
     for name in FILES:
         if (ROOT / name).exists():
             shutil.copy(ROOT / name, source / name)
@@ -40,9 +45,24 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_everything_is_where_ros_looks_for_it(install: Path) -> None:
     assert (install / "lib/dyfn_ros/stream_depth").stat().st_mode & 0o111
     share = install / "share/dyfn_ros"
-    for name in ("package.xml", "launch/stream_depth.launch.py", "config/stream_depth.yaml"):
+    names = ["launch/stream_depth.launch.py", "launch/stream_depth_cameras.launch.py"]
+    names += ["package.xml", "config/stream_depth.yaml", "config/cameras/realsense.yaml"]
+    for name in names:
         assert (share / name).is_file(), name
     assert (install / "share/ament_index/resource_index/packages/dyfn_ros").is_file()
+
+
+def test_colcon_runs_the_tests_and_reports_them(install: Path) -> None:
+    workspace = install.parents[1]
+    colcon = [sys.executable, "-m", "colcon"]
+    run = [*colcon, "test", "--executor", "sequential", "--return-code-on-test-failure"]
+    tested = subprocess.run(run, cwd=workspace, capture_output=True, text=True)
+    assert tested.returncode == 0, tested.stdout + tested.stderr
+    result = [*colcon, "test-result", "--all"]
+    report = subprocess.run(result, cwd=workspace, capture_output=True, text=True).stdout
+    found = re.search(r"Summary: (\d+) tests, 0 errors, 0 failures", report)
+    assert found, report
+    assert int(found[1]) > 100
 
 
 def test_the_installed_node_runs_with_its_parameter_file(install: Path, tmp_path: Path) -> None:

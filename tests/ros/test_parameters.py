@@ -25,6 +25,27 @@ def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
     }
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "config/cameras").iterdir()), ids=lambda p: p.stem)
+def test_a_cameras_file_sets_parameters_that_are_allowed(path: Path) -> None:
+    ((nodes, content),) = yaml.safe_load(path.read_text()).items()
+    assert nodes == "/**/stream_depth"
+    values = {"use_sim_time": False, **content["ros__parameters"]}
+    del values["use_sim_time"]
+    own = {name: values.pop(name) for name in values.get("cameras", ()) if name in values}
+    assert check_cameras(values.get("cameras", [""])) == ""
+    for camera in (values, *own.values()):
+        assert set(camera) <= set(SPECS)
+        assert check(camera, vars(Settings())) == ""
+        for name, value in camera.items():
+            assert type(value) is type(SPECS[name].default), name
+    assert all(SPECS[name].per_camera for camera in own.values() for name in camera)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "launch").iterdir()), ids=lambda p: p.stem)
+def test_a_launch_file_compiles(path: Path) -> None:
+    compile(path.read_text(), str(path), "exec")
+
+
 def test_manual_and_parameter_file_are_written_from_the_table() -> None:
     """Run `python -m dyfn_ros.parameter_docs` after a change of the table."""
     manual = (ROOT / "docs/node.md").read_text()
