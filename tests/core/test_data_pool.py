@@ -216,7 +216,7 @@ def test_clip_knows_its_masks_points_and_poses_under_one_augmentation() -> None:
             world = points[index][clip.valid[index]] @ turn.T + move
             on_floor = np.abs(world[:, 1] - FLOOR)
             balls = [np.linalg.norm(world - BALL * [side, 1, 1], axis=-1) for side in (1, -1)]
-            error = np.minimum(on_floor, np.abs(np.min(balls, 0) - RADIUS))
+            error = np.minimum(on_floor, np.min(np.abs(np.array(balls) - RADIUS), 0))
             distance = np.linalg.norm(points[index][clip.valid[index]], axis=-1)
             assert np.quantile(error / distance, 0.99) < 0.011  # half a pixel
     assert sky > 0
