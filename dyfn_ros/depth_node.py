@@ -12,6 +12,7 @@ from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
 from dyfn_ros.camera import Camera, Job
@@ -61,7 +62,10 @@ class StreamDepthNode(LifecycleNode):
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
         self._ports = Ports(self, self._warn)
         self._diagnostics = self.create_publisher(
-            DiagnosticArray, "/diagnostics", QoSProfile(depth=10)
+            DiagnosticArray,
+            "/diagnostics",
+            QoSProfile(depth=10),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
     @property
@@ -106,8 +110,9 @@ class StreamDepthNode(LifecycleNode):
         self._worker.start()
         while self.context.ok() and not self._worker.wait_prepared(_POLL):
             pass
-        if self._worker.error is not None or not self.context.ok():
+        if self._worker.error is not None:
             self.get_logger().error(f"cannot configure: {self._worker.error!r}")
+        if self._worker.error is not None or not self.context.ok():
             self._release_all()
             return FAILURE
         self._phase = "inactive"
@@ -225,7 +230,8 @@ class StreamDepthNode(LifecycleNode):
         dropped = sum(self._reset(index, REQUESTED) for index in indices)
         response.success = True
         response.message = f"the next frame starts anew ({dropped} waiting frames dropped)"
-        self.get_logger().info(f"reset: {response.message}")
+        if line := self._throttle(f"reset: {response.message}"):
+            self.get_logger().info(line)
         return response
 
     def _on_state(

@@ -30,7 +30,12 @@ def _make(args: Sequence[str] | None, load: ModelLoader) -> StreamDepthNode | No
 def _autostart(node: StreamDepthNode) -> bool:
     """Configure and activate. -> whether that worked; the node has said why if not."""
     success = TransitionCallbackReturn.SUCCESS
-    return node.trigger_configure() == success and node.trigger_activate() == success
+    try:
+        return node.trigger_configure() == success and node.trigger_activate() == success
+    except RuntimeError:  # the state machine cannot publish into a context that has ended
+        if node.context.ok():
+            raise
+        return False
 
 
 def _run(node: StreamDepthNode) -> int:
