@@ -154,7 +154,7 @@ class Settings(MetricSettings):
 
     scene_cut_threshold: float = _parameter(
         _STREAM,
-        0.5,
+        0.6,
         "Difference of two pictures in a row beyond which the camera is somewhere else and the "
         "stream starts anew; 0 switches it off. See docs/metric_scale.md.",
         changes=RUN,

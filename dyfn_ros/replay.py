@@ -30,6 +30,7 @@ from dyfn_core.evaluation.sequence import (
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
 from dyfn_ros.replay_recording import ReplayRecording
+from dyfn_ros.scene_cut import SceneCutHook
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -56,6 +57,7 @@ class Options:
     threads: int | None = None
     depth_max: float = math.inf
     tolerance: float = 0.02
+    scene_cut_threshold: float = 0.0
     output_recording: bool = True
 
 
@@ -82,6 +84,12 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     add("--threads", type=_positive, help="CPU threads for inference")
     add("--depth-max", type=_distance, default=math.inf, help="cap of the ground truth, metres")
     add("--tolerance", type=_distance, default=0.02, help="seconds from image to ground truth")
+    add(
+        "--scene-cut-threshold",
+        type=_distance,
+        default=0.0,
+        help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
+    )
     add("--no-output-recording", dest="output_recording", action="store_false")
     return Options(**vars(parser.parse_args(arguments)))
 
@@ -141,7 +149,8 @@ def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFr
 
 
 def _run(options: Options, recording: Recording, model: GeometryModel) -> SequenceEvaluation:
-    camera = CameraStream(stream_maker(model))
+    cuts = SceneCutHook(lambda: options.scene_cut_threshold)
+    camera = CameraStream(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
     with ExitStack() as stack:
@@ -204,6 +213,7 @@ def _write_results(
             "stride": options.stride,
             "max_frames": options.max_frames,
             "num_tokens": options.num_tokens,
+            "scene_cut_threshold": options.scene_cut_threshold,
             "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
         },
     }

@@ -13,6 +13,7 @@ GRID = (4, 4)  # blocks across and down
 BLOCK = (SIZE[0] // GRID[0], SIZE[1] // GRID[1])
 REACH = (20, 14)  # pixels of displacement that are searched, across and down
 SLACK = 3  # size of the window within which a block may deviate from the common displacement
+THRESHOLD = 0.6  # where a false alarm weighs as much as three misses: benchmarks/scene_cuts.py
 _TEXTURE = 3.0  # grey levels of standard deviation below which a block shows nothing
 _FEWEST = 5  # blocks that must be comparable for a displacement to count
 _BINS = 8  # of the histogram, along each of two chromaticities
@@ -135,7 +136,7 @@ class SceneCutDetector:
     something is compared with the last one that did, for up to ten blank ones.
     """
 
-    def __init__(self, threshold: float = 0.5, release: float = 0.8) -> None:
+    def __init__(self, threshold: float = THRESHOLD, release: float = 0.8) -> None:
         if not 0 < threshold < 2 or not 0 < release <= 1:
             raise ValueError(f"threshold {threshold} must be in 0..2 and release {release} in 0..1")
         self.threshold, self.release = threshold, release
