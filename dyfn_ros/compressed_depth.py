@@ -68,7 +68,9 @@ def encode_compressed_depth(
         b = 1.0 - a / farthest
         # Nearer than this the 16 bits overflow.
         inside = valid & (depth < farthest) & (depth > a / (65535 - b))
-        values = np.where(inside, a / np.where(inside, depth, 1.0) + b, 0).astype(np.uint16)
+        values = np.rint(np.where(inside, a / np.where(inside, depth, 1.0) + b, 0)).astype(
+            np.uint16
+        )
     ok, data = cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:
         raise MessageError(f"a depth image of {depth.shape} could not be compressed")

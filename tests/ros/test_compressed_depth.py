@@ -6,7 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_ros.compressed_depth import decode_compressed_depth, is_compressed_depth
+from dyfn_ros.compressed_depth import (
+    decode_compressed_depth,
+    encode_compressed_depth,
+    is_compressed_depth,
+)
 from dyfn_ros.encodings import MessageError
 from dyfn_ros.recording_writer import compressed_message
 
@@ -45,6 +49,28 @@ def test_compressed_depth_of_32fc1_is_inverse_depth() -> None:
     decoded = decode_compressed_depth(depth)
     np.testing.assert_allclose(decoded[:, :3], metres, rtol=1e-3)
     assert np.isnan(decoded[0, 3])
+
+
+@pytest.mark.parametrize(("encoding", "error"), [("32FC1", 1e-3), ("16UC1", 2e-3)])
+def test_what_is_packed_is_unpacked(encoding: str, error: float) -> None:
+    depth = np.geomspace(0.5, 9.9, 60, dtype=np.float32).reshape(6, 10)
+    valid = np.arange(60).reshape(6, 10) % 7 != 0
+    layout, data = encode_compressed_depth(depth, valid, encoding)
+    assert layout == f"{encoding}; compressedDepth png"
+    decoded = decode_compressed_depth(message(layout, data))
+    assert np.array_equal(np.isnan(decoded), ~valid)
+    np.testing.assert_allclose(decoded[valid], depth[valid], rtol=error)
+
+
+def test_what_does_not_fit_is_packed_as_none() -> None:
+    depth = np.array([[0.05, 0.2, 5.0, 19.0, 21.0, 70.0]], np.float32)
+    valid = np.ones((1, 6), bool)
+    layout, data = encode_compressed_depth(depth, valid, farthest=20.0)
+    found = np.isfinite(decode_compressed_depth(message(layout, data)))
+    assert found.tolist() == [[False, True, True, True, False, False]]
+    layout, data = encode_compressed_depth(depth, valid, "16UC1")
+    found = np.isfinite(decode_compressed_depth(message(layout, data)))
+    assert found.tolist() == [[True, True, True, True, True, False]]
 
 
 def test_colour_is_not_depth() -> None:

@@ -30,6 +30,6 @@ def report(name: str) -> None:
 
 
 if __name__ == "__main__":
-    for builder in ("depth_message", "cloud_message"):
+    for builder in ("depth_message", "cloud_message", "colour_message", "compressed_message"):
         report(builder)
     sys.exit(main(load=load))
