@@ -44,6 +44,12 @@ class Probe:
             self.executor.spin_once(timeout_sec=0.02)
         return value
 
+    def spin_until(self, condition: Callable[[], Any], seconds: float) -> None:
+        """Until the condition is true, or so long."""
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.02)
+
     def listen(self, topic: str, kind: type, qos: QoSProfile = RELIABLE) -> list[Any]:
         """-> the messages so far; grows while this object waits."""
         name = topic if topic.startswith("/") else f"{NODE}/{topic}"

@@ -107,10 +107,12 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
 
 def primed(rig: Rig) -> Rig:
     """Both cameras' frames come back, and none is under way."""
+    rig.probe.wait(lambda: rig.probe.received["/diagnostics"])  # spins: the model is loaded
     for camera in BOTH:
-        while not rig.probe.received[f"{camera}/depth/image"]:
+        topic = f"{camera}/depth/image"
+        while not rig.probe.received[topic]:
             rig.send(camera, frames(1)[0])
-            rig.probe.executor.spin_once(timeout_sec=0.05)
+            rig.probe.spin_until(lambda t=topic: rig.probe.received[t], 1.0)
         rig.play(camera, frames(1))
     return rig
 

@@ -55,14 +55,17 @@ def send(probe: Probe, stamp: int, qos: QoSProfile = RELIABLE) -> int:
 
 
 def answered(probe: Probe, stamp: int, qos: QoSProfile = RELIABLE) -> Any:
-    """Send frames from this stamp on, a millisecond apart, until one comes back; -> it."""
+    """Send frames from this stamp on, a millisecond apart, until one comes back; -> it.
+
+    With time between them: a slow machine must not have to work off a queue.
+    """
     depths = probe.received["depth/image"]
     count = len(depths)
 
     def one_more() -> bool:
         nonlocal stamp
         stamp = send(probe, stamp + 1_000_000, qos)
-        probe.executor.spin_once(timeout_sec=0.1)
+        probe.spin_until(lambda: len(depths) > count, 1.0)
         return len(depths) > count
 
     probe.wait(one_more)
