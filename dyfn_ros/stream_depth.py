@@ -47,7 +47,11 @@ def _run(node: StreamDepthNode) -> int:
         return 0  # interrupted
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    executor.spin()
+    try:
+        executor.spin()
+    except RuntimeError:  # a callback that published into a context that had just ended
+        if node.context.ok():
+            raise
     return 0
 
 
