@@ -143,10 +143,14 @@ class Camera:
                 "full, newer frames are lost; play slower or raise it",
             )
 
-    def request_reset(self, reason: str) -> None:
-        """Frames that came before this call never touch the state after it. Any thread."""
+    def request_reset(self, reason: str) -> int:
+        """Frames that came before this call never touch the state after it. Any thread.
+
+        -> the number of resets asked for so far.
+        """
         with self._epoch_lock:
             self._epoch, self._request = self._epoch + 1, reason
+            return self._epoch
 
     # Any thread.
 
@@ -157,13 +161,12 @@ class Camera:
     def load_state(self) -> str:
         """As request_reset, with the state of a file. -> what was loaded. Raises StateError."""
         settings = self.settings
-
-        def begin() -> int:
-            self.request_reset(REQUESTED)
-            return self._epoch
-
-        path = self._state_file()
-        return self._opened().load(path, begin, settings.stabilize, settings.num_tokens)
+        return self._opened().load(
+            self._state_file(),
+            lambda: self.request_reset(REQUESTED),
+            settings.stabilize,
+            settings.num_tokens,
+        )
 
     def _opened(self) -> StateHook:
         if self.state is None:

@@ -122,6 +122,8 @@ class Calibrator:
         kept: list[Evidence] = []
         for one in reversed(window):
             age = now - one.stamp
+            if age < -seconds:  # of a clock that has been set back since
+                continue
             if age > _PATIENT * seconds or (
                 age > seconds * (1 + 1e-9) and points >= self.options.min_points
             ):
@@ -157,7 +159,7 @@ class Calibrator:
         apart = _log_difference(old, fit)
         limit = options.disagreement * (0.5 if state.disagrees else 1.0)
         if abs(apart) > limit:
-            since = now if state.contradicted_since is None else state.contradicted_since
+            since = now if state.contradicted_since is None else min(state.contradicted_since, now)
             disagrees = state.disagrees or now - since >= options.patience
             if disagrees and options.mode == "track":
                 state = self._calibrated(fit, now)

@@ -113,6 +113,14 @@ def test_old_evidence_is_not_used_and_memory_is_bounded() -> None:
     assert len(calibrator.state.window) == 1
 
 
+def test_a_clock_that_was_set_back_does_not_keep_evidence_of_the_future() -> None:
+    calibrator = Calibrator()
+    play(calibrator, 2.0, 1000, 1002)
+    play(calibrator, 2.0, 0, 3)
+    assert len(calibrator.state.window) <= 11
+    assert all(one.stamp < 4 for one in calibrator.state.window)
+
+
 def test_empty_evidence_explains_why_there_is_no_scale() -> None:
     calibrator = Calibrator()
     calibrator.push(
