@@ -30,6 +30,7 @@ LATENT_STRIDE = 8
 FEATURE_SPREAD = (7.0, 6.0, 2.5)  # standard deviations of the ImageNet encoder's features
 VIEW_SLOPE = 0.8  # x / z at the edge of a view plane of unit half diagonal, before training
 RAW_LIMIT = 8.0
+SLOPE = 0.1  # of the activations below zero: none can die
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,10 @@ class MiniConfig:
 
     latent_channels: C of the latent. stage_channels: the decoder's channels at strides 8, 4, ...,
     one stage each; the outputs come from the last, at twice its resolution. context_channels,
-    context_layers, context_heads: the transformer on the stride-32 map. num_tokens: default
-    budget, in cells of 16 x 16 pixels (192 = 256 x 192). folded: the encoder's normalisation is
-    part of its weights.
+    context_layers, context_heads: the transformer on the stride-32 map. refine: a residual block
+    after each sum of the neck, so that finer features decide where coarse depth ends. num_tokens:
+    default budget, in cells of 16 x 16 pixels (192 = 256 x 192). folded: the encoder's
+    normalisation is part of its weights.
     """
 
     latent_channels: int = 96
@@ -48,23 +50,31 @@ class MiniConfig:
     context_channels: int = 192
     context_layers: int = 2
     context_heads: int = 6
+    refine: bool = True
     num_tokens: int = 192
     folded: bool = True
 
 
 class ResidualBlock(nn.Module):
-    """x + conv(relu(conv(relu(norm(x)))))."""
+    """x + conv(act(norm(conv(act(norm(x)))))), every channel normalised by itself.
+
+    The latent's channels sit at very different levels, and that is where it keeps the scale. Norms
+    over groups of channels let the largest decide, the others reach the activation as constants,
+    and no gradient ever tells an edge from a wall.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(max(1, channels // 32), channels)
-        self.first = nn.Conv2d(channels, channels, 3, padding=1)
+        self.norm = nn.GroupNorm(channels, channels)
+        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm_second = nn.GroupNorm(channels, channels)
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
-        nn.init.normal_(self.second.weight, std=1e-3)
+        nn.init.normal_(self.second.weight, std=1e-2)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.second(F.relu(self.first(F.relu(self.norm(x)))))
+        inner = self.first(F.leaky_relu(self.norm(x), SLOPE))
+        return x + self.second(F.leaky_relu(self.norm_second(inner), SLOPE))
 
 
 class ContextLayer(nn.Module):
@@ -111,6 +121,8 @@ class Neck(nn.Module):
         self.project_fine = nn.Conv2d(fine, channels, 1)
         self.project_middle = nn.Conv2d(middle, channels, 1)
         self.project_deep = nn.Conv2d(config.context_channels, channels, 1)
+        self.refine_middle = ResidualBlock(channels) if config.refine else nn.Identity()
+        self.refine_fine = ResidualBlock(channels) if config.refine else nn.Identity()
 
     def forward(self, features: list[Tensor]) -> Tensor:
         fine, middle, deep = (
@@ -119,7 +131,9 @@ class Neck(nn.Module):
         size = fine.shape[-2:]
         deep = self.project_deep(self.context(self.context_in(deep)))
         coarse = self.project_middle(middle) + _resize(deep, middle.shape[-2:])
-        return self.project_fine(fine) + _resize(coarse, size)
+        coarse = self.refine_middle(coarse)
+        latent: Tensor = self.refine_fine(self.project_fine(fine) + _resize(coarse, size))
+        return latent
 
 
 class Decoder(nn.Module):
@@ -138,11 +152,11 @@ class Decoder(nn.Module):
         nn.init.normal_(out.weight, std=1e-2)
         nn.init.zeros_(out.bias)  # type: ignore[arg-type]
         self.points = nn.Sequential(
-            nn.Conv2d(channels + 2, 32, 3, padding=1), nn.ReLU(), out, nn.PixelShuffle(2)
+            nn.Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
         )
         self.mask = nn.Sequential(
             nn.Conv2d(channels + 2, 16, 3, padding=1),
-            nn.ReLU(),
+            nn.LeakyReLU(SLOPE),
             nn.Conv2d(16, 4, 1),
             nn.PixelShuffle(2),
         )

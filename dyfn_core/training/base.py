@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_sequences
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
+from dyfn_core.losses.gradient import gradient_loss
 from dyfn_core.losses.local import local_loss
 from dyfn_core.losses.mask import mask_loss
 from dyfn_core.losses.normal import normal_loss
@@ -98,6 +99,7 @@ class BaseTask(Task):
         ]
         normal = normal_loss(points, target, self.config.normal_stride)
         masks, canonical = mask_loss(mask, target), canonical_scale_loss(points, target)
+        edges = gradient_loss(points, target)
         excess = (raw.abs() - LARGEST_RAW).clamp(min=0).square().mean()
         total = (
             frame
@@ -105,11 +107,21 @@ class BaseTask(Task):
             + self.config.normal_weight * normal
             + self.config.mask_weight * masks
             + self.config.scale_weight * canonical
+            + self.config.gradient_weight * edges
             + excess
         )
-        names = ("loss", "frame", "local_4", "local_16", "normal", "mask", "scale", "excess")
-        terms = (total, frame, *local, normal, masks, canonical, excess)
-        return total, {name: float(term.detach()) for name, term in zip(names, terms, strict=True)}
+        terms = {
+            "loss": total,
+            "frame": frame,
+            "local_4": local[0],
+            "local_16": local[1],
+            "normal": normal,
+            "mask": masks,
+            "scale": canonical,
+            "edges": edges,
+            "excess": excess,
+        }
+        return total, {name: float(term.detach()) for name, term in terms.items()}
 
     def _forward(self, batch: ClipBatch) -> tuple[Tensor, Tensor, float]:
         image = batch.image[:, 0].float() / 255

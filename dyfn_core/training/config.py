@@ -165,6 +165,7 @@ class BaseRunConfig(RunConfig):
     normal_stride: int = Field(4, ge=1)
     mask_weight: float = Field(1.0, ge=0)
     scale_weight: float = Field(0.3, ge=0)
+    gradient_weight: float = Field(0.5, ge=0)
     balls: tuple[int, int] = (8, 12)
 
     @field_validator("model")
