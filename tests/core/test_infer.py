@@ -20,8 +20,12 @@ def noise(seed: int, *size: int) -> np.ndarray:
 
 
 def same(one: Prediction, other: Prediction) -> bool:
+    def agree(a: object, b: object) -> bool:
+        both = isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor)
+        return torch.equal(a, b) if both else a == b  # type: ignore[arg-type]
+
     return all(
-        torch.equal(getattr(one, field.name), getattr(other, field.name))
+        agree(getattr(one, field.name), getattr(other, field.name))
         for field in fields(Prediction)
         if field.name != "state"
     )

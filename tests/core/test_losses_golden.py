@@ -86,14 +86,17 @@ def cases(shared: Path, pattern: str) -> list[str]:
     return found
 
 
-def check_gradient(found: Tensor | None, wanted: Tensor, relative: float = 1e-3) -> None:
+def check_gradient(
+    found: Tensor | None, wanted: Tensor, relative: float = 1e-3, chance: float = 0.005
+) -> None:
     """Equal but where the residual of an L1 term is 0 to rounding, so that its sign is chance.
 
-    The alignment passes through some samples exactly: there is a handful of those in each case.
+    An alignment passes through some samples exactly. chance: the largest share of such entries; a
+    whole step, where frames, balls and the clip are all aligned, has more than one term alone.
     """
     assert found is not None
     off = (found - wanted).abs() > 1e-3 * wanted.abs() + relative * wanted.abs().max() + 1e-12
-    assert float(off.float().mean()) < 0.005, f"{int(off.sum())} of {off.numel()}"
+    assert float(off.float().mean()) < chance, f"{int(off.sum())} of {off.numel()}"
 
 
 @cache
@@ -335,4 +338,4 @@ def test_whole_training_step(shared_dir: Path) -> None:
         total, tensor(shared_dir, f"{case}/out/loss_total"), rtol=1e-3, atol=0
     )
     assert own.grad is not None
-    check_gradient(own.grad[0], tensor(shared_dir, f"{case}/out/grad_pred"))
+    check_gradient(own.grad[0], tensor(shared_dir, f"{case}/out/grad_pred"), chance=0.01)

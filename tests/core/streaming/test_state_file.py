@@ -92,7 +92,7 @@ def test_everything_else_comes_back_as_it_was(small_moge: MoGeModel, tmp_path: P
     assert loaded.cut is not None
     assert loaded.cut.look is not None
     assert detector.state.look is not None
-    np.testing.assert_array_equal(loaded.cut.look.opponent, detector.state.look.grey)
+    np.testing.assert_array_equal(loaded.cut.look.opponent, detector.state.look.opponent)
 
 
 def test_a_new_stream_and_one_without_dyfn_can_be_saved(
