@@ -1,0 +1,111 @@
+"""DyFN from the base's own scale errors: what is summarised, and what training changes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from training_toys import tiny_base, tiny_stabilizer_settings
+
+from dyfn_core.cli.train import main
+from dyfn_core.data.clips import draw_batch, find_sequences
+from dyfn_core.models.base import AffinePoints, Latent
+from dyfn_core.models.checkpoints import load_model
+from dyfn_core.training.config import ConfigError, ScaleRunConfig, read_config
+from dyfn_core.training.latents import encode_clips
+from dyfn_core.training.run_folder import read_log
+from dyfn_core.training.scale import ScaleTask
+from dyfn_core.training.summaries import mean_log_z, scale_slope, summarise_clips
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """base.safetensors, data/ and config.yaml."""
+    folder = tmp_path_factory.mktemp("scale")
+    tiny_base(folder)
+    settings = tiny_stabilizer_settings(folder)
+    del settings["cache_draws"], settings["decoded"]
+    recurrence = {"hidden": 4, "pool": 2, "form": "residual", "standardize": True}
+    settings |= {"summary_draws": 2, "strides": [1, 1], "stabilizer": recurrence, "log_every": 1}
+    (folder / "config.yaml").write_text(yaml.safe_dump(settings))
+    return folder
+
+
+def task(place: Path, cache: Path, *overrides: str) -> ScaleTask:
+    return ScaleTask(read_config(place / "config.yaml", ScaleRunConfig, list(overrides)), cache)
+
+
+def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Path) -> None:
+    made = task(place, tmp_path)
+    batch = draw_batch(made.source, find_sequences(made.source, "train"), 0)
+    parts = summarise_clips(made.model, batch)
+    clips = encode_clips(made.model, batch)
+    latent = Latent(clips.latent[0, 2:3].float(), (16, 32), clips.network_size)
+    affine = made.model.decode(latent)
+    assert isinstance(affine, AffinePoints)
+    z, true = affine.points[0, ..., 2], clips.depth[0, 2].float()
+    known = torch.isfinite(true) & (true > 0)
+    fx, fy = (float(v) for v in batch.intrinsics[0, 2, :2])
+    focal = 0.5 * (fx * 64 + fy * 32) / math.hypot(64, 32)
+    wanted = (z[known].log() - (true[known] / focal).log()).mean()
+    torch.testing.assert_close(parts["error"][0, 2], wanted, rtol=1e-4, atol=1e-4)
+    assert parts["summary"].shape == (1, 4, 8, 2, 4)
+
+
+def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path: Path) -> None:
+    made = task(place, tmp_path)
+    torch.manual_seed(3)
+    features = torch.randn(1, 8, 4, 8)
+    latent, depth = Latent(features, (16, 32), (32, 64)), torch.ones(1, 16, 32)
+    slope = scale_slope(made.model, latent, depth)
+    change = 0.01 * torch.randn(16)
+    std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
+    gamma, beta = (part.view(1, 8, 1, 1) for part in change.chunk(2))
+    moved = replace(latent, features=gamma.exp() * (features - mean) + mean + std * beta)
+    with torch.no_grad():
+        found = mean_log_z(made.model, moved, depth) - mean_log_z(made.model, latent, depth)
+    torch.testing.assert_close(found[0], slope @ change, rtol=0.05, atol=1e-5)
+
+
+def test_training_lowers_the_spread_of_the_scales(place: Path, tmp_path: Path) -> None:
+    made = task(place, tmp_path, "noise=0", "length=4", "clips=2", "change_weight=0")
+    batch = next(iter(made.batches(0)))
+    optimizer = torch.optim.Adam(made.groups()[0]["params"], lr=0.05)
+    spreads = []
+    for _ in range(250):
+        loss, values = made.loss(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        spreads.append(values["spread"])
+    assert spreads[0] == pytest.approx(values["base_spread"], rel=1e-4)
+    assert spreads[-1] < 0.85 * spreads[0]
+
+
+def test_command_trains_dyfn_alone_and_keeps_the_usual_statistics(
+    place: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    assert main(["scale", str(place / "config.yaml"), "--out", str(out)]) == 0
+    base, trained = load_model(place / "base.safetensors"), load_model(out / "model.safetensors")
+    assert trained.stabilizer is not None
+    for name, value in base.state_dict().items():
+        torch.testing.assert_close(trained.state_dict()[name], value, rtol=0, atol=0)
+    assert float(trained.stabilizer.get_buffer("usual_std").std()) > 0
+    scores = [line for line in read_log(out / "log.jsonl") if line["group"] == "validation"]
+    assert {"rendered_base_video", "rendered_dyfn_video"} <= set(scores[-1])
+
+
+def test_the_papers_form_has_no_corrections_to_learn(place: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'residual', got 'paper'"):
+        task(place, tmp_path, "stabilizer.form=paper")
+
+
+def test_summaries_of_another_recurrence_are_refused(place: Path, tmp_path: Path) -> None:
+    task(place, tmp_path)
+    with pytest.raises(ConfigError, match="recurrence"):
+        task(place, tmp_path, "stabilizer.pool=1")
