@@ -67,6 +67,7 @@ class NodeProcess:
                     **os.environ,
                     "ROS_LOG_DIR": str(folder),
                     "OMP_NUM_THREADS": "1",
+                    "PYTHONFAULTHANDLER": "1",
                     **environment,
                 },
                 cwd=folder,

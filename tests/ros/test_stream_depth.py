@@ -16,6 +16,7 @@ import torch
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from ros_graph import (
+    DEADLINE,
     NODE,
     Client,
     Gate,
@@ -468,7 +469,7 @@ def test_a_node_that_cannot_run_says_why_and_exits_with_one(
     graph: Graph, parameters: dict[str, Any], reason: str
 ) -> None:
     node = graph.start(**parameters)
-    assert node.process.wait(60) == 1
+    assert node.process.wait(DEADLINE) == 1
     assert re.search(reason, node.log), node.log
     assert "Traceback" not in node.log
 
