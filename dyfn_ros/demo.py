@@ -94,6 +94,7 @@ def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, R
     parameters = {
         "model": options.model,
         "drop_frames": False,
+        "scene_cut_threshold": 0.0,  # as in dyfn-replay, so that both give the same bytes
         "wait_for_camera_info": first.info is not None,
         "image_transport": "compressed" if first.source.kind == COMPRESSED_IMAGE else "raw",
     }

@@ -134,12 +134,12 @@ class StreamDepthNode(LifecycleNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give the model, the topics and the memory back."""
-        self._release_all()
+        self._release_and_say()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """As cleanup; the node cannot be configured again."""
-        self._release_all()
+        self._release_and_say()
         self._phase = "finalized"
         return super().on_shutdown(state)
 
@@ -156,7 +156,7 @@ class StreamDepthNode(LifecycleNode):
                 self._worker.discard(index)
 
     def _release_all(self) -> tuple[list[str], bool]:
-        """-> the last words, said already if there is a context, and whether the worker ended."""
+        """-> the last words about each camera, and whether the worker ended."""
         self._set_active(False)
         done = self._worker is None or self._worker.stop(_PATIENCE)
         for undo in reversed(self._made):
@@ -164,11 +164,13 @@ class StreamDepthNode(LifecycleNode):
         self._made = []
         self._ports.close()
         lines = self._summary()
-        for line in lines if self.context.ok() else []:
-            self.get_logger().info(line)
         self._cameras, self._worker = [], None
         self._phase = "unconfigured"
         return lines, done
+
+    def _release_and_say(self) -> None:
+        for line in self._release_all()[0]:
+            self.get_logger().info(line)
 
     # What a configured node is made of.
 
@@ -327,9 +329,9 @@ class StreamDepthNode(LifecycleNode):
 
     def close(self) -> bool:
         """Release everything and say what became of the frames. -> whether the worker is done."""
-        logger, ended = self.get_logger(), not self.context.ok()
+        logger = self.get_logger()
         lines, done = self._release_all()
-        self.destroy_node()  # first: a signal has ended the context that rosout needs
-        for line in lines if ended else []:
+        self.destroy_node()  # first: a signal ends, now or soon, the context that rosout needs
+        for line in lines:
             logger.info(line)
         return done

@@ -80,6 +80,7 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     }
     for key in ("received", "published", "bad", "failed"):
         values[key] = str(snapshot.counts.get(key, 0))
+    values["received while inactive"] = str(snapshot.counts.get("inactive", 0))
     resets = dict(camera.stream.resets)
     values["resets"] = str(sum(resets.values()))
     values.update({f"resets: {reason}": str(count) for reason, count in resets.items()})

@@ -29,6 +29,7 @@ OUTPUTS = {"depth/image": Image, "depth/camera_info": CameraInfo, "points": Poin
 START_PATIENCE = 180.0  # seconds for imports and loading the model, on a busy machine
 FRAME_PATIENCE = 60.0
 PRIME_INTERVAL = 0.5
+ASK_INTERVAL = 10.0  # DDS loses an answer to a client whose endpoints are not all known yet
 RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -182,11 +183,13 @@ class LivePlayer:
                 return False
 
     def _call(self, kind: Any, name: str, request: Any) -> Any:
+        """For requests that may be done twice."""
         client = self._node.create_client(kind, f"{self._name}/{name}")
         if not self._wait(client.service_is_ready, FRAME_PATIENCE):
             raise LiveError(f"{self._name}/{name}: no such service")
-        future = client.call_async(request)
-        if not self._wait(future.done, FRAME_PATIENCE):
-            raise LiveError(f"{self._name}/{name}: no answer within {FRAME_PATIENCE:.0f} s")
-        self._node.destroy_client(client)
-        return future.result()
+        for _ in range(round(FRAME_PATIENCE / ASK_INTERVAL)):
+            future = client.call_async(request)
+            if self._wait(future.done, ASK_INTERVAL):
+                self._node.destroy_client(client)
+                return future.result()
+        raise LiveError(f"{self._name}/{name}: no answer within {FRAME_PATIENCE:.0f} s")

@@ -52,6 +52,8 @@ def _run(node: StreamDepthNode) -> int:
     except RuntimeError:  # a callback that published into a context that had just ended
         if node.context.ok():
             raise
+    finally:
+        executor.shutdown()  # its guard conditions must not outlive the context
     return 0
 
 

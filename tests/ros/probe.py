@@ -70,11 +70,31 @@ class Probe:
         """A service of the node."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, f"{NODE}/{name}")
+            self._be_known()
         client = self._clients[name]
         self.wait(client.service_is_ready)
         future = client.call_async(request)
         self.wait(future.done)
         return future.result()
+
+    def _be_known(self) -> None:
+        """Until the node has seen all of our endpoints; else DDS may lose its answer to us.
+
+        They are announced in order: who answers a client made now has seen those made before.
+        """
+        client = self.node.create_client(GetState, f"{NODE}/get_state")
+        self.wait(client.service_is_ready)
+        futures: list[Any] = []
+
+        def answered() -> bool:
+            return any(future.done() for future in futures)
+
+        deadline = time.monotonic() + DEADLINE
+        while not answered():
+            assert time.monotonic() < deadline, "the node does not answer"
+            futures.append(client.call_async(GetState.Request()))
+            self.spin_until(answered, 10.0)
+        self.node.destroy_client(client)
 
     def trigger(self, name: str) -> Trigger.Response:
         return self.call(Trigger, name, Trigger.Request())

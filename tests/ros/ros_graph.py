@@ -67,6 +67,7 @@ class NodeProcess:
                     **os.environ,
                     "ROS_LOG_DIR": str(folder),
                     "OMP_NUM_THREADS": "1",
+                    "PYTHONFAULTHANDLER": "1",
                     **environment,
                 },
                 cwd=folder,
@@ -174,6 +175,12 @@ class Client:
             assert time.monotonic() < deadline, f"waited {seconds} s in vain"
             self.executor.spin_once(timeout_sec=0.02)
 
+    def spin_until(self, condition: Callable[[], bool], seconds: float) -> None:
+        """Until the condition is true, or so long."""
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.02)
+
     def header(self) -> Header:
         self._stamp += 1
         header = Header(frame_id="optical")
@@ -203,14 +210,13 @@ class Client:
 
         Frames are sent until one comes back whole; then the last one is waited for.
         """
+        self.settle()  # a node that is still loading would get a queue full of them
         stamps: list[int] = []
         deadline = time.monotonic() + DEADLINE
         while not any(len(self.received[s]) == 3 for s in stamps):
             assert time.monotonic() < deadline, "no frame came back"
             stamps.append(self.send(frames(1)[0]))
-            until = time.monotonic() + 0.3
-            while len(self.received[stamps[-1]]) < 3 and time.monotonic() < until:
-                self.executor.spin_once(timeout_sec=0.02)
+            self.spin_until(lambda: len(self.received[stamps[-1]]) == 3, 0.3)
         last = self.send(frames(1)[0])
         self.result(last)
 
@@ -227,10 +233,19 @@ class Client:
         assert self.set_parameter("publish_points", True).successful
 
     def _call(self, client: Any, request: Any) -> Any:
+        """Asks again now and then: DDS loses an answer to a client whom the node knows half."""
         self.wait(client.service_is_ready)
-        future = client.call_async(request)
-        self.wait(future.done)
-        return future.result()
+        futures: list[Any] = []
+
+        def answered() -> bool:
+            return any(future.done() for future in futures)
+
+        deadline = time.monotonic() + DEADLINE
+        while not answered():
+            assert time.monotonic() < deadline, f"no answer from {client.srv_name}"
+            futures.append(client.call_async(request))
+            self.spin_until(answered, 10.0)
+        return next(future for future in futures if future.done()).result()
 
     def close(self) -> None:
         self.executor.shutdown()

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_graph import HERE, own_domain
+from ros_graph import DEADLINE, HERE, own_domain
 from test_replay import rgbd
 from tiny_model import load_tiny
 
@@ -95,7 +95,7 @@ def test_a_signal_ends_the_demo_and_its_node(tmp_path: Path, number: int) -> Non
             if "waiting for the node" in line:
                 break
         demo.send_signal(number)
-        _, error = demo.communicate(timeout=40)
+        _, error = demo.communicate(timeout=DEADLINE)
     assert demo.returncode == 130
     assert "interrupted" in error
     pid = (tmp_path / "pid").read_text() if (tmp_path / "pid").exists() else None

@@ -16,6 +16,7 @@ import torch
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from ros_graph import (
+    DEADLINE,
     NODE,
     Client,
     Gate,
@@ -403,13 +404,10 @@ def test_depth_alone_is_built_for_its_subscriber_and_an_interrupt_waits_for_nobo
             Image, f"{NODE}/depth/image", lambda m: client._take("depth/image", m), 10
         )
     )
-    stamps: list[int] = []
-
-    def arrived() -> bool:
-        stamps.append(client.send(frames(1)[0]))
-        return any(client.received[s] for s in stamps)
-
-    client.wait(arrived)
+    client.settle()
+    while not client.order:  # until the node has seen the subscription
+        client.send(frames(1)[0])
+        client.spin_until(lambda: bool(client.order), 0.3)
     client.send(blocking_picture())
     graph.gate.wait_entered()
     assert node.end(signal.SIGINT) == 0
@@ -468,7 +466,7 @@ def test_a_node_that_cannot_run_says_why_and_exits_with_one(
     graph: Graph, parameters: dict[str, Any], reason: str
 ) -> None:
     node = graph.start(**parameters)
-    assert node.process.wait(60) == 1
+    assert node.process.wait(DEADLINE) == 1
     assert re.search(reason, node.log), node.log
     assert "Traceback" not in node.log
 
