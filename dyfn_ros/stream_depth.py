@@ -10,6 +10,7 @@ import rclpy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.signals import uninstall_signal_handlers
 
 from dyfn_ros.depth_node import ModelLoader, StreamDepthNode, load_bundled
 from dyfn_ros.environment import prepare_environment
@@ -53,7 +54,8 @@ def _run(node: StreamDepthNode) -> int:
         if node.context.ok():
             raise
     finally:
-        executor.shutdown()  # its guard conditions must not outlive the context
+        uninstall_signal_handlers()  # their thread still touches the executor's guard conditions
+        executor.shutdown()
     return 0
 
 
