@@ -20,6 +20,11 @@ def scale_spread_loss(points: Tensor, target: ClipTarget) -> Tensor:
     count = target.valid.sum((2, 3))
     seen = (count > 0).float()
     scale = ratio.sum((2, 3)) / count.clamp(min=1)
+    return spread(scale, seen)
+
+
+def spread(values: Tensor, seen: Tensor) -> Tensor:
+    """Mean absolute deviation of B x T finite values from their row's mean, where seen is 1."""
     frames = seen.sum(1, keepdim=True).clamp(min=1)
-    mean = (scale * seen).sum(1, keepdim=True) / frames
-    return (((scale - mean).abs() * seen).sum(1) / frames[:, 0]).mean()
+    mean = (values * seen).sum(1, keepdim=True) / frames
+    return (((values - mean).abs() * seen).sum(1) / frames[:, 0]).mean()

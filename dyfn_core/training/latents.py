@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -52,61 +52,65 @@ def encode_clips(model: GeometryModel, batch: ClipBatch) -> LatentClips:
     )
 
 
-class LatentCache:
-    """`draws` batches of encoded clips in a folder, made once and kept in memory.
+class CacheFolder:
+    """`draws` numbered files of tensors in a folder, each made from one batch of clips.
 
-    The folder says which model and which clip source it was made with; a folder made with others
-    is an error, not a surprise. An interrupted build goes on where it stopped.
+    The folder says what it was made with (wanted); a folder made with something else is an error,
+    not a surprise. An interrupted build goes on where it stopped. holds: what the files are, for
+    messages.
     """
 
-    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
-        self.folder, self.source, self.draws = folder, source, draws
+    def __init__(self, folder: Path, draws: int, wanted: dict[str, Any], holds: str) -> None:
+        self.folder, self.draws, self.holds = folder, draws, holds
         folder.mkdir(parents=True, exist_ok=True)
-        self._check(fingerprint(model, source))
-        self._build(model)
-        self.entries = [self._load(index) for index in range(draws)]
-
-    def _check(self, wanted: dict[str, Any]) -> None:
-        path = self.folder / META
+        path = folder / META
         if not path.exists():
             path.write_text(json.dumps(wanted, indent=1))
         found = json.loads(path.read_text())
         other = sorted(key for key in wanted if found.get(key) != wanted[key])
         if other:
             raise ConfigError(
-                f"{self.folder} holds latents made with another {', '.join(other)}: "
+                f"{folder} holds {holds} made with another {', '.join(other)}: "
                 "delete it or give another `cache`"
             )
 
-    def _build(self, model: GeometryModel) -> None:
+    def build(self, source: ClipSource, make: Callable[[ClipBatch], dict[str, Tensor]]) -> None:
+        """Make the files that are missing, each whole or not at all."""
         missing = [index for index in range(self.draws) if not self._path(index).exists()]
         if not missing:
             return
-        batches = batch_loader(self.source, missing[0])
-        for index in track(range(missing[0], self.draws), description="encoding clips"):
-            clips = encode_clips(model, next(batches))
-            parts = {
+        batches = batch_loader(source, missing[0])
+        for index in track(range(missing[0], self.draws), description=f"making {self.holds}"):
+            parts = make(next(batches))
+            partial = self._path(index).with_suffix(".partial")
+            save_file(parts, partial)
+            partial.replace(self._path(index))
+
+    def load(self) -> list[dict[str, Tensor]]:
+        """All files in order."""
+        return [load_file(self._path(index)) for index in range(self.draws)]
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:05d}.safetensors"
+
+
+class LatentCache:
+    """`draws` batches of encoded clips in a folder (CacheFolder), made once and kept in memory."""
+
+    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
+        def make(batch: ClipBatch) -> dict[str, Tensor]:
+            clips = encode_clips(model, batch)
+            return {
                 "latent": clips.latent,
                 "depth": clips.depth,
                 "intrinsics": clips.intrinsics,
                 "image_size": torch.tensor(clips.image_size),
                 "network_size": torch.tensor(clips.network_size),
             }
-            partial = self._path(index).with_suffix(".partial")
-            save_file(parts, partial)
-            partial.replace(self._path(index))
 
-    def _path(self, index: int) -> Path:
-        return self.folder / f"{index:05d}.safetensors"
-
-    def _load(self, index: int) -> LatentClips:
-        parts = load_file(self._path(index))
-        height, width = parts["image_size"].tolist()
-        # Caches of `mini` from before other models had none: it works at the clip's size.
-        rows, columns = parts.get("network_size", parts["image_size"]).tolist()
-        return LatentClips(
-            parts["latent"], parts["depth"], parts["intrinsics"], (height, width), (rows, columns)
-        )
+        files = CacheFolder(folder, draws, fingerprint(model, source), "latents")
+        files.build(source, make)
+        self.entries = [_latent_clips(parts) for parts in files.load()]
 
     def batches(self, start: int, seed: int, clips: int, length: int) -> Iterator[LatentClips]:
         """Endless random batches of one size: sub-clips of `length`, as they were or reversed."""
@@ -121,6 +125,15 @@ class LatentCache:
             latent, depth, intrinsics = (torch.stack(parts) for parts in zip(*chosen, strict=True))
             yield LatentClips(latent, depth, intrinsics, group[0].image_size, group[0].network_size)
             step += 1
+
+
+def _latent_clips(parts: dict[str, Tensor]) -> LatentClips:
+    height, width = parts["image_size"].tolist()
+    # Caches of `mini` from before other models had none: it works at the clip's size.
+    rows, columns = parts.get("network_size", parts["image_size"]).tolist()
+    return LatentClips(
+        parts["latent"], parts["depth"], parts["intrinsics"], (height, width), (rows, columns)
+    )
 
 
 def _sub_clip(

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyfn_core.losses.scale_spread import spread
 from dyfn_core.prediction import StreamState
 from dyfn_core.training.config import ConfigError, ScaleRunConfig
 from dyfn_core.training.latents import LatentClips
@@ -64,7 +65,7 @@ class ScaleTask(StabilizerTask):
         error = torch.where(seen, batch.error + change @ self.slope, 0.0)
         before = torch.where(seen, batch.error, 0.0)
         terms = {
-            "spread": _spread(error, seen),
+            "spread": spread(error, seen.float()),
             "size": error.abs().sum() / seen.sum().clamp(min=1),
             "change": change.square().mean(),
         }
@@ -75,7 +76,7 @@ class ScaleTask(StabilizerTask):
         }
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         values = {name: float(term.detach()) for name, term in terms.items()}
-        values["base_spread"] = float(_spread(before, seen))
+        values["base_spread"] = float(spread(before, seen.float()))
         return total, {"loss": float(total.detach()), **values}
 
     def _corrections(self, summary: Tensor) -> Tensor:
@@ -113,10 +114,3 @@ def _as_clips(sequence: Sequence) -> LatentClips:
         sequence.image_size,
         sequence.network_size,
     )
-
-
-def _spread(error: Tensor, seen: Tensor) -> Tensor:
-    """Mean absolute deviation of B x T errors from their clip's mean, where seen."""
-    count = seen.sum(1, keepdim=True).clamp(min=1)
-    mean = torch.where(seen, error, 0.0).sum(1, keepdim=True) / count
-    return (torch.where(seen, (error - mean).abs(), 0.0).sum(1) / count[:, 0]).mean()

@@ -7,20 +7,18 @@ clip shrinks from megabytes to kilobytes a frame, and a step of training needs n
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
-from rich.progress import track
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
+from dyfn_core.data.clips import ClipBatch, ClipSource
 from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent
 from dyfn_core.training.config import ConfigError
-from dyfn_core.training.latents import META, encode_clips, fingerprint
+from dyfn_core.training.latents import CacheFolder, encode_clips, fingerprint
 
 FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
 
@@ -35,18 +33,19 @@ class SummaryClips:
 
 
 class SummaryCache:
-    """`draws` clips in a folder, made once and kept in memory; interrupted builds go on.
+    """`draws` clips in a folder (CacheFolder), made once and kept in memory.
 
     slope: 2C, the mean derivative of a frame's error by DyFN's residual gamma and beta. Raises
     ConfigError when the folder was made with another model or source.
     """
 
     def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
-        self.folder, self.source, self.draws = folder, source, draws
-        folder.mkdir(parents=True, exist_ok=True)
-        self._check(model)
-        self._build(model)
-        parts = [load_file(self._path(index)) for index in range(draws)]
+        assert model.stabilizer is not None
+        wanted = fingerprint(model, source)
+        wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
+        files = CacheFolder(folder, draws, wanted, "summaries")
+        files.build(source, partial(summarise_clips, model))
+        parts = files.load()
         self.summary = torch.cat([part["summary"] for part in parts])
         self.error = torch.cat([part["error"] for part in parts])
         self.slope = torch.stack([part["slope"] for part in parts]).mean(0)
@@ -82,35 +81,6 @@ class SummaryCache:
         if below(2):
             index = index.flip(0)
         return self.summary[clip, index], self.error[clip, index]
-
-    def _check(self, model: GeometryModel) -> None:
-        assert model.stabilizer is not None
-        wanted = fingerprint(model, self.source)
-        wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
-        path = self.folder / META
-        if not path.exists():
-            path.write_text(json.dumps(wanted, indent=1))
-        found = json.loads(path.read_text())
-        other = sorted(key for key in wanted if found.get(key) != wanted[key])
-        if other:
-            raise ConfigError(
-                f"{self.folder} holds summaries made with another {', '.join(other)}: "
-                "delete it or give another `cache`"
-            )
-
-    def _build(self, model: GeometryModel) -> None:
-        missing = [index for index in range(self.draws) if not self._path(index).exists()]
-        if not missing:
-            return
-        batches = batch_loader(self.source, missing[0])
-        for index in track(range(missing[0], self.draws), description="summarising clips"):
-            parts = summarise_clips(model, next(batches))
-            partial = self._path(index).with_suffix(".partial")
-            save_file(parts, partial)
-            partial.replace(self._path(index))
-
-    def _path(self, index: int) -> Path:
-        return self.folder / f"{index:05d}.safetensors"
 
 
 def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
