@@ -41,7 +41,10 @@ setup(
     maintainer="The dyfn_ros maintainers",
     maintainer_email="maintainers@dyfn-ros.invalid",
     packages=find_packages(include=["dyfn_core*", "dyfn_ros*"]),
-    package_data={"dyfn_core": ["weights/*", "training/*.yaml"]},
+    package_data={
+        "dyfn_core": ["weights/*", "training/*.yaml"],
+        "dyfn_ros": ["fastdds_images.xml"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),

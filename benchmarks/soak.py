@@ -68,6 +68,7 @@ def soak(options: argparse.Namespace) -> list[dict[str, float]]:
         "model": options.model,
         "cameras": "[camera]",
         "threads": options.threads,
+        "reliability": "reliable",
     }
     if options.num_tokens:
         parameters["num_tokens"] = options.num_tokens

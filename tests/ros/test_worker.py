@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -332,33 +331,3 @@ def test_normalised_and_pixel_intrinsics_project_to_the_same_place() -> None:
     x, y, _ = intrinsics @ ray
     u, v, _ = matrix @ ray
     assert ((u + 0.5) / 64, (v + 0.5) / 48) == pytest.approx((x, y))
-
-
-def test_environment_adds_a_venv_with_ros_and_leaves_a_sourced_ros_alone(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dyfn_ros import environment
-
-    def prefix(name: str, holds_ros: bool) -> str:
-        packages = tmp_path / name / "share/ament_index/resource_index/packages"
-        packages.mkdir(parents=True)
-        if holds_ros:
-            (packages / "rclpy").touch()
-        return str(tmp_path / name)
-
-    venv, plain = prefix("venv", True), prefix("plain", False)
-    overlay, ros = prefix("overlay", False), prefix("ros", True)
-    cases = [
-        (venv, None, venv),
-        (venv, "", venv),
-        (venv, overlay, f"{overlay}:{venv}"),
-        (venv, f"{overlay}:{ros}", f"{overlay}:{ros}"),
-        (plain, None, None),
-        (plain, overlay, overlay),
-    ]
-    for sys_prefix, before, after in cases:
-        variables = {} if before is None else {"AMENT_PREFIX_PATH": before}
-        monkeypatch.setattr(environment, "sys", SimpleNamespace(prefix=sys_prefix))
-        monkeypatch.setattr(environment.os, "environ", variables)
-        environment.prepare_environment()
-        assert variables.get("AMENT_PREFIX_PATH") == after
