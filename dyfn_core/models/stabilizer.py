@@ -32,6 +32,9 @@ class StabilizerConfig:
     standardize: the recurrence sees every channel less its usual mean, over its usual deviation:
         constants of the checkpoint, zero and one until training sets them. For latents whose
         channels sit at very different levels.
+    memory_only: residual corrections are those of the stream less those of a stream that begins
+        at this frame. What one picture says about its scale is left to the base: the first frame
+        is the base's, bit for bit, and only the past can change a later one.
     """
 
     kind: str = "convgru"
@@ -39,6 +42,7 @@ class StabilizerConfig:
     pool: int = 1
     form: str = "paper"
     standardize: bool = False
+    memory_only: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -48,6 +52,10 @@ class StabilizerConfig:
         if self.hidden < 1 or self.pool < 1:
             raise ValueError(
                 f"stabilizer hidden ({self.hidden}) and pool ({self.pool}) must be at least 1"
+            )
+        if self.memory_only and self.form != "residual":
+            raise ValueError(
+                f"stabilizer memory_only needs the form 'residual', got form {self.form!r}"
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,11 +123,23 @@ class Stabilizer(nn.Module, ABC):
     def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
         """What the recurrence sees of a latent: B x C, or B x C x h' x w'."""
 
-    @abstractmethod
     def recur(
         self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         """As remember, from a summary; the residual form has no use for mean and std."""
+        gamma, beta, after = self._step(summary, mean, std, state)
+        if not self.config.memory_only:
+            return gamma, beta, after
+        if state is None:
+            return torch.zeros_like(gamma), torch.zeros_like(beta), after
+        alone_gamma, alone_beta, _ = self._step(summary, mean, std, None)
+        return gamma - alone_gamma, beta - alone_beta, after
+
+    @abstractmethod
+    def _step(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        """gamma and beta (B x C) of the hidden state after this frame, and the next state."""
 
     def standardized(self, summary: Tensor) -> Tensor:
         """The summary in units of its usual values, when the config asks for that."""
@@ -169,7 +189,7 @@ class ConvGRUStabilizer(Stabilizer):
         nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
         nn.init.zeros_(self.beta_head.bias)  # type: ignore[arg-type]
 
-    def recur(
+    def _step(
         self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         x = self.standardized(summary)
@@ -212,7 +232,7 @@ class GRUStabilizer(Stabilizer):
     def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
         return mean
 
-    def recur(
+    def _step(
         self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         x = self.standardized(summary)

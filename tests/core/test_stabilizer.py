@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import pytest
 import torch
 
@@ -24,6 +26,55 @@ def make(kind: str, form: str = "paper", pool: int = 1, trained: bool = True) ->
             if "head" in name:
                 torch.nn.init.normal_(parameter, std=0.3)
     return module.eval()
+
+
+def memory_only(kind: str) -> torch.nn.Module:
+    torch.manual_seed(1)
+    config = StabilizerConfig(kind=kind, hidden=7, form="residual", memory_only=True)
+    module = build_stabilizer(5, config)
+    for parameter in module.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    return module.eval()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_only_leaves_a_first_frame_alone_and_changes_later_ones(kind: str) -> None:
+    module = memory_only(kind)
+    with torch.no_grad():
+        first, state = module(latent(0), None)
+        second, _ = module(latent(1), state)
+    assert torch.equal(first, latent(0))
+    assert (second - latent(1)).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_only_holds_for_each_stream_of_a_batch(kind: str) -> None:
+    module = memory_only(kind)
+    with torch.no_grad():
+        _, state = module(latent(0), None)
+        _, fresh = module(latent(0), None)
+        fresh = replace(fresh, hidden=torch.zeros_like(fresh.hidden))
+        if fresh.ema_mean is not None:
+            nan = torch.full_like(fresh.ema_mean, torch.nan)
+            fresh = replace(fresh, ema_mean=nan, ema_std=nan)
+        both, _ = module(latent(1).expand(2, -1, -1, -1), stacked(state, fresh))
+    assert torch.equal(both[1:], latent(1))
+    assert not torch.equal(both[:1], latent(1))
+
+
+def stacked(one: StreamState, other: StreamState) -> StreamState:
+    parts = {
+        field.name: None
+        if getattr(one, field.name) is None
+        else torch.cat([getattr(one, field.name), getattr(other, field.name)])
+        for field in fields(StreamState)
+    }
+    return StreamState(**parts)
+
+
+def test_memory_only_belongs_to_the_residual_form() -> None:
+    with pytest.raises(ValueError, match="memory_only needs the form 'residual', got form 'paper'"):
+        StabilizerConfig(memory_only=True)
 
 
 def test_paper_form_starts_with_the_released_statistics() -> None:
