@@ -41,7 +41,7 @@ setup(
     maintainer="The dyfn_ros maintainers",
     maintainer_email="maintainers@dyfn-ros.invalid",
     packages=find_packages(include=["dyfn_core*", "dyfn_ros*"]),
-    package_data={"dyfn_core": ["weights/*", "training/*.yaml"]},
+    package_data={"dyfn_core": ["weights/*", "training/*.yaml", "evaluation/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (SHARE, ["package.xml"]),
@@ -79,6 +79,7 @@ setup(
             "dyfn-replay = dyfn_ros.replay:main",
             "dyfn-demo = dyfn_ros.demo:main",
             "dyfn-train = dyfn_core.cli.train:main",
+            "dyfn-eval = dyfn_core.cli.eval:main",
             "dyfn-worlds = dyfn_core.cli.worlds:main",
         ],
         "dyfn_core.data_kinds": ["recording = dyfn_ros.training_data:RECORDING"],

@@ -159,9 +159,12 @@ class PredictionFolder:
         return next(frames)
 
     def _key(self, path: Path) -> str | None:
-        if self.key is not None and path.suffix == ".npz":
-            return npz_key(path, (self.key,)) and self.key
-        return npz_key(path, KEYS)
+        if self.key is None or path.suffix == ".npy":
+            return npz_key(path, KEYS)
+        found = npz_key(path, (self.key,))
+        if found != self.key:
+            raise FrameError(f"{path}: expected the key {self.key}, found {found}")
+        return found
 
     def _scaled(self, frames: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
         factor = np.float32(1 if self.scale is None else 1 / self.scale)

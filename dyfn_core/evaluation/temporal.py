@@ -31,7 +31,7 @@ class View:
 def reprojection_error(
     depth: np.ndarray, other: np.ndarray, view: View, other_view: View
 ) -> tuple[float, int] | None:
-    """AbsRel of `depth`, moved into the other view, against `other` there; and over how many pixels.
+    """AbsRel of `depth`, moved into the other view, against `other`; and over how many pixels.
 
     depth, other: H x W in the unit of the poses, not finite or <= 0 where invalid. A point falls
     on the pixel nearest to its projection; of several on one pixel the nearest to the camera
@@ -133,7 +133,7 @@ class TemporalScorer:
 
     def __init__(self, samples: int = 20_000) -> None:
         self.samples = samples
-        self._file: IO[bytes] = tempfile.TemporaryFile()
+        self._file: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - lives until close()
         self._views: list[View | None] = []
         self._shapes: list[tuple[int, int]] = []
         self._names: tuple[str, ...] = ()

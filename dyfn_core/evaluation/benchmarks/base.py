@@ -52,7 +52,7 @@ class Settings:
             )
         if not self.depth_max > 0 or min(self.crop) < 0:
             raise ValueError(
-                f"depth_max must be positive and crop not negative, got {self.depth_max}, {self.crop}"
+                f"depth_max must be positive, crop not negative: {self.depth_max}, {self.crop}"
             )
 
 
