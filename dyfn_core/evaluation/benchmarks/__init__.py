@@ -193,6 +193,8 @@ def _open(
         folder = depthcrafter.video_folder(root, known.video_set) if known.video_set else None
         try:
             sources = [] if folder is None else depthcrafter.open_videos(folder, report)
+            flat = {name.replace("/", "_"): name for name in known.sequences}
+            sources = [replace(s, name=flat.get(s.name, s.name)) for s in sources]
         except FrameError as error:
             raise DataError(str(error)) from error
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ __all__ = ["EXPECTED", "SETTINGS", "open_rgbd", "rgbd_sources"]
 
 SETTINGS = Settings()
 LAYOUTS = ("rgb.txt", "frame-*.color.*", "color", "rgb")  # what tells each of them
-NO_CUT = 1 << 40  # a benchmark's sequence is one, whatever frames it lacks
+NO_CUT = 1 << 40  # frames or seconds: a benchmark's sequence is one, whatever it lacks
 LEVELS = 3  # folders below the root that are searched
 
 
@@ -52,7 +51,7 @@ def rgbd_sources(
     found = []
     for folder in folders_holding(root, entry, LEVELS):
         sequences = open_rgbd_folder(
-            folder, report, intrinsics=intrinsics, max_gap=math.inf, max_missing=NO_CUT
+            folder, report, intrinsics=intrinsics, max_gap=NO_CUT, max_missing=NO_CUT
         )
         for sequence in sequences:
             if isinstance(sequence, NumberedSequence) and len(sequence):
