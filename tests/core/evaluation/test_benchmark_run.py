@@ -1,4 +1,4 @@
-"""dyfn-eval from the command line: scores by value, tables, controls, published numbers, lengths."""
+"""dyfn-eval from the command line: scores by value, tables, published numbers, lengths."""
 
 from __future__ import annotations
 
@@ -53,11 +53,9 @@ def test_files_are_scored_by_value(tmp_path: Path, capsys: pytest.CaptureFixture
         depth=np.stack([drifting(i) for i in range(6)]),
     )
     out = tmp_path / "out"
-    status = cli.main(
-        ["score", "--benchmark", "tum", "--root", str(root), "--predictions", str(folder)]
-        + ["--quantity", "depth", "--out", str(out), "--all-pixels"]
-    )
-    assert status == 0
+    arguments = ["score", "--benchmark", "tum", "--root", str(root), "--predictions", str(folder)]
+    arguments += ["--quantity", "depth", "--out", str(out), "--all-pixels"]
+    assert cli.main(arguments) == 0
     scores = read(out)["variants"]["mine"]
     assert scores["image"]["abs_rel"] < 1e-4  # truth is rounded to 0.2 mm
     assert scores["video"]["abs_rel"] > 0.05
