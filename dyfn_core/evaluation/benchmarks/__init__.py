@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from dyfn_core.data.datasets.files import nothing_found
-from dyfn_core.data.frames import DataError, DataReport, FrameError
+from dyfn_core.data.frames import DataError, DataReport
 from dyfn_core.evaluation.benchmarks import (
     bonn,
     depthcrafter,
@@ -21,6 +21,7 @@ from dyfn_core.evaluation.benchmarks import (
     tum,
 )
 from dyfn_core.evaluation.benchmarks.base import (
+    UNREADABLE,
     Benchmark,
     BenchmarkFrame,
     BenchmarkSequence,
@@ -153,6 +154,7 @@ def open_benchmark(
         settings = default_settings(known, found_layout)
     chosen = [select(source, settings) for source in sources]
     missing = _missing(known, chosen, settings, sequences)
+    missing += report.problems.get(UNREADABLE, [])
     chosen = [s for s in chosen if len(s) and (not sequences or s.name in sequences)]
     if not sequences and known.sequences:
         extra = [s.name for s in chosen if s.name not in known.sequences]
@@ -191,12 +193,9 @@ def _open(
     if layout == DEPTHCRAFTER:
         expected = depthcrafter.EXPECTED.replace("<set>", known.video_set or "<set>")
         folder = depthcrafter.video_folder(root, known.video_set) if known.video_set else None
-        try:
-            sources = [] if folder is None else depthcrafter.open_videos(folder, report)
-            flat = {name.replace("/", "_"): name for name in known.sequences}
-            sources = [replace(s, name=flat.get(s.name, s.name)) for s in sources]
-        except FrameError as error:
-            raise DataError(str(error)) from error
+        sources = [] if folder is None else depthcrafter.open_videos(folder, report)
+        flat = {name.replace("/", "_"): name for name in known.sequences}
+        sources = [replace(s, name=flat.get(s.name, s.name)) for s in sources]
     else:
         expected += f" (or {depthcrafter.EXPECTED})" if known.video_set else ""
         sources = known.open(root, report)

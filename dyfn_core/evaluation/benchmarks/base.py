@@ -88,6 +88,7 @@ class BenchmarkSequence:
             yield cropped(frame, self.crop, self.name)
 
 
+UNREADABLE = "sequence that cannot be read"  # a report's reason; such a sequence is missing
 Opener = Callable[[Path, DataReport], list[Source]]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dyfn_core.data.frames import DataReport, FrameError
 from dyfn_core.evaluation.arrays import frames_of_array, npz_key
-from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, Source
+from dyfn_core.evaluation.benchmarks.base import UNREADABLE, BenchmarkFrame, Source
 
 EXPECTED = (
     "<set>/<sequence>_rgb_left.mp4 and <set>/<sequence>_disparity.npz, whose key `disparity` "
@@ -32,7 +32,8 @@ def video_folder(root: Path, video_set: str) -> Path | None:
 def open_videos(folder: Path, report: DataReport) -> list[Source]:
     """Sequences by the name before `_rgb_left.mp4`. Truth <= 0 is invalid (0 or -1 in the files).
 
-    Truth is paired with its video by name. There is no camera and no pose.
+    Truth is paired with its video by name. There is no camera and no pose. Pairs
+    that cannot be read are counted in the report.
     """
     found = []
     for video in sorted(folder.glob(f"*{VIDEO}")):
@@ -41,7 +42,11 @@ def open_videos(folder: Path, report: DataReport) -> list[Source]:
         if not truth.exists():
             report.miss(f"video without its {TRUTH}", video)
             continue
-        shape, _ = frames_of_array(truth, npz_key(truth, KEYS))
+        try:
+            shape, _ = frames_of_array(truth, npz_key(truth, KEYS))
+        except FrameError as error:
+            report.miss(UNREADABLE, error)
+            continue
         found.append(Source(name, range(shape[0]), partial(_read, video, truth)))
     for truth in sorted(folder.glob(f"*{TRUTH}")):
         if not truth.with_name(truth.name.removesuffix(TRUTH) + VIDEO).exists():

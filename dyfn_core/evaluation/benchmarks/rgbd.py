@@ -7,8 +7,14 @@ from pathlib import Path
 
 from dyfn_core.data.datasets.files import folders_holding
 from dyfn_core.data.datasets.rgbd_folder import EXPECTED, Camera, open_rgbd_folder
-from dyfn_core.data.frames import DataReport, NumberedSequence
-from dyfn_core.evaluation.benchmarks.base import Settings, Source, from_rgbd, one_by_one
+from dyfn_core.data.frames import DataError, DataReport, FrameError, NumberedSequence
+from dyfn_core.evaluation.benchmarks.base import (
+    UNREADABLE,
+    Settings,
+    Source,
+    from_rgbd,
+    one_by_one,
+)
 
 __all__ = ["EXPECTED", "SETTINGS", "open_rgbd", "rgbd_sources"]
 
@@ -46,13 +52,17 @@ def rgbd_sources(
     """One source per folder that holds something matching `entry`, without cuts at gaps.
 
     named: folder -> the sequence's name. intrinsics: in pixels of the colour image, instead of
-    the folder's own.
+    the folder's own. A folder that cannot be read is counted in the report as UNREADABLE.
     """
     found = []
     for folder in folders_holding(root, entry, LEVELS):
-        sequences = open_rgbd_folder(
-            folder, report, intrinsics=intrinsics, max_gap=NO_CUT, max_missing=NO_CUT
-        )
+        try:
+            sequences = open_rgbd_folder(
+                folder, report, intrinsics=intrinsics, max_gap=NO_CUT, max_missing=NO_CUT
+            )
+        except (DataError, FrameError) as error:
+            report.miss(UNREADABLE, error)
+            continue
         for sequence in sequences:
             if isinstance(sequence, NumberedSequence) and len(sequence):
                 reader = sequence.reader

@@ -253,6 +253,19 @@ def test_an_incomplete_root_says_what_is_missing_and_scores_the_rest_when_asked(
         open_benchmark("sintel", tmp_path, sequences=["ambush_6", "nowhere"])
 
 
+def test_a_sequence_that_cannot_be_opened_is_missing_and_the_others_are_scored(
+    tmp_path: Path,
+) -> None:
+    make_tum(tmp_path / "rgbd_dataset_freiburg1_good", 3)
+    make_tum(tmp_path / "rgbd_dataset_freiburg1_bad", 3)
+    (tmp_path / "rgbd_dataset_freiburg1_bad" / "depth.txt").unlink()
+    with pytest.raises(DataError, match=r"missing: .*freiburg1_bad.depth\.txt: cannot be read"):
+        open_benchmark("tum", tmp_path)
+    opened = open_benchmark("tum", tmp_path, allow_missing=True)
+    assert [s.name for s in opened.sequences] == ["rgbd_dataset_freiburg1_good"]
+    assert len(opened.missing) == 1
+
+
 def test_what_the_paper_says_is_the_default() -> None:
     counts = {name: len(BENCHMARKS[name].sequences) for name in ("sintel", "scannet", "kitti")}
     assert counts == {"sintel": 23, "scannet": 100, "kitti": 13}
