@@ -42,7 +42,7 @@ setup(
     maintainer_email="maintainers@dyfn-ros.invalid",
     packages=find_packages(include=["dyfn_core*", "dyfn_ros*"]),
     package_data={
-        "dyfn_core": ["weights/*", "training/*.yaml"],
+        "dyfn_core": ["weights/*", "training/*.yaml", "evaluation/*.json"],
         "dyfn_ros": ["fastdds_images.xml"],
     },
     data_files=[
@@ -82,6 +82,7 @@ setup(
             "dyfn-replay = dyfn_ros.replay:main",
             "dyfn-demo = dyfn_ros.demo:main",
             "dyfn-train = dyfn_core.cli.train:main",
+            "dyfn-eval = dyfn_core.cli.eval:main",
             "dyfn-worlds = dyfn_core.cli.worlds:main",
         ],
         "dyfn_core.data_kinds": ["recording = dyfn_ros.training_data:RECORDING"],

@@ -15,6 +15,8 @@ from dyfn_core.prediction import DEPTH, DISPARITY
 FARTHEST = 1e4  # metres: depth where aligned disparity is not positive, unless capped below
 MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is clipped to it
 MIN_PIXELS = 16  # frames with fewer scored samples are not scored
+ALL_PIXELS = 1 << 62  # as samples_per_frame and max_samples: nothing is left out
+L1, LEAST_SQUARES = FITS = ("l1", "lstsq")
 
 
 @dataclass(frozen=True)
@@ -58,6 +60,8 @@ class SequenceScorer:
     depth_max: cap in metres: truth beyond it is invalid, aligned depth is clipped to it.
     quantity: "disparity" when predictions are affine-invariant disparity: every alignment is then
     min sum d |s p + t - 1/d|, and the inverse of the aligned disparity is scored as depth.
+    fit: "l1", the paper's weighted one, or "lstsq", plain least squares without weights, against d
+    (against 1/d for disparity).
     Invalid predictions (masked, NaN, infinite, not positive) take no part in fit or score; they
     lower `coverage` instead of counting as depth 0.
     """
@@ -68,12 +72,16 @@ class SequenceScorer:
         samples_per_frame: int = 20_000,
         max_samples: int = 4_000_000,
         quantity: str = DEPTH,
+        fit: str = L1,
     ) -> None:
         if quantity not in (DEPTH, DISPARITY):
             raise ValueError(
                 f"quantity {quantity!r} is unknown, expected {DEPTH!r} or {DISPARITY!r}"
             )
+        if fit not in FITS:
+            raise ValueError(f"fit {fit!r} is unknown, expected one of {FITS}")
         self.quantity = quantity
+        self.fit = fit
         self.depth_max = depth_max
         self.samples_per_frame = samples_per_frame
         self.max_samples = max_samples
@@ -125,9 +133,10 @@ class SequenceScorer:
         return self._aligned(1.0, 0.0)
 
     def _fit(self, prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
-        if self.quantity == DISPARITY:
-            return fit_scale_shift(prediction, 1 / target, target)
-        return fit_scale_shift(prediction, target, 1 / target)
+        wanted = 1 / target if self.quantity == DISPARITY else target
+        if self.fit == LEAST_SQUARES:
+            return least_squares(prediction, wanted)
+        return fit_scale_shift(prediction, wanted, 1 / wanted)
 
     def _aligned(self, scale: float, shift: float) -> SequenceScore:
         frames = [
@@ -164,6 +173,20 @@ class SequenceScorer:
             self._step *= 2
             self._kept = [(p[::2].copy(), d[::2].copy()) for p, d in self._kept]
             self._total = sum(p.size for p, _ in self._kept)
+
+
+def least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
+    """The (scale, shift) that minimise sum (scale * prediction + shift - target)^2, unweighted.
+
+    Arrays of one size. A constant prediction gives scale 1.
+    """
+    x, y = prediction.astype(np.float64).ravel(), target.astype(np.float64).ravel()
+    x_mean, y_mean = x.mean(), y.mean()
+    variance = np.mean((x - x_mean) ** 2)
+    if variance <= 1e-24 * max(1.0, x_mean**2):
+        return 1.0, float(y_mean - x_mean)
+    scale = float(np.mean((x - x_mean) * (y - y_mean)) / variance)
+    return scale, float(y_mean - scale * x_mean)
 
 
 def predicted(prediction: np.ndarray, quantity: str = DEPTH) -> np.ndarray:

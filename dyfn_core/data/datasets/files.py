@@ -131,7 +131,10 @@ def needed(module: str, path: Path) -> Any:
     try:
         return __import__(module)
     except ImportError as error:
-        raise DataError(f"{path}: reading it needs {module}: pip install {module}") from error
+        raise DataError(
+            f"{path}: reading it needs {module}: pip install {module}, or "
+            "this package's extra `datasets`"
+        ) from error
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:

@@ -1,0 +1,307 @@
+"""dyfn-eval: score a model, or any method's files, on public benchmarks of video depth.
+
+Exit status: 0 everything was scored; 3 something of the benchmark was missing or could not be
+scored, and --allow-missing let the rest go on; 2 nothing could be scored, or bad arguments.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmark_run import Scoring, evaluate
+from dyfn_core.evaluation.benchmark_table import write_json, write_results
+from dyfn_core.evaluation.benchmarks import (
+    AUTO,
+    BENCHMARKS,
+    LAYOUTS,
+    Benchmark,
+    Opened,
+    benchmark,
+    default_settings,
+    find_layout,
+    open_benchmark,
+)
+from dyfn_core.evaluation.long_sequence import (
+    LENGTHS,
+    length_table,
+    long_sequences,
+    write_lengths,
+)
+from dyfn_core.evaluation.model_method import ModelMethod
+from dyfn_core.evaluation.predictions import QUANTITIES, ArrayMethod, Method, PredictionFolder
+from dyfn_core.evaluation.protocols import ALL_PIXELS, FITS, L1
+from dyfn_core.evaluation.report import text_table
+from dyfn_core.models.checkpoints import load_model
+
+COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        command: Callable[[argparse.Namespace], int] = options.run
+        return command(options)
+    except (DataError, FrameError, OSError, ValueError) as error:
+        print(f"dyfn-eval: {error}", file=sys.stderr)
+        return UNUSABLE
+    except KeyboardInterrupt:
+        print("dyfn-eval: interrupted; nothing was written", file=sys.stderr)
+        return 130
+
+
+def _list(options: argparse.Namespace) -> int:
+    for known in BENCHMARKS.values():
+        print(_described(known))
+    return COMPLETE
+
+
+def _described(known: Benchmark) -> str:
+    settings = known.settings
+    rows, columns = settings.crop
+    count = f"{len(known.sequences)} sequences" if known.sequences else "whatever sequences it has"
+    frames = "all frames" if settings.frames is None else f"at most {settings.frames} frames"
+    every = "" if settings.stride == 1 else f", stride {settings.stride}"
+    start = f", from frame {settings.first} (counted from 0)" if settings.first else ""
+    cap = "no cap" if math.isinf(settings.depth_max) else f"cap {settings.depth_max:g} m"
+    crop = (
+        f"; crop {rows} px above and below, {columns} left and right" if any(settings.crop) else ""
+    )
+    videos = f"; or {known.video_set}/*_rgb_left.mp4" if known.video_set else ""
+    return (
+        f"{known.name}: {known.title}\n  {count}; {frames}{every}{start}; "
+        f"{cap}{crop}\n  {known.expected}{videos}"
+    )
+
+
+def _model(options: argparse.Namespace) -> Method:
+    return ModelMethod(
+        options.name or Path(options.model).stem,
+        load_model(options.model, options.device),
+        stabilize=options.stabilizer,
+        controls=options.controls,
+        num_tokens=options.num_tokens,
+        known_camera=options.known_camera,
+    )
+
+
+def _files(options: argparse.Namespace) -> Method:
+    folder = PredictionFolder(options.predictions, options.scale, options.key)
+    name = options.name or options.predictions.resolve().name
+    return ArrayMethod(name, options.quantity, folder.arrays)
+
+
+def _method(options: argparse.Namespace) -> Method:
+    return _model(options) if getattr(options, "model", None) else _files(options)
+
+
+def _open(options: argparse.Namespace, frames: int | None = None) -> Opened:
+    """The benchmark with what the command line overrides."""
+    known = benchmark(options.benchmark)
+    settings = default_settings(known, find_layout(known, options.root, options.layout))
+    crop = None if options.crop is None else tuple(options.crop)
+    given: dict[str, Any] = {
+        "first": options.first,
+        "stride": options.stride,
+        "frames": options.frames if frames is None else frames,
+        "depth_max": options.depth_max,
+        "crop": crop,
+    }
+    settings = replace(settings, **{k: v for k, v in given.items() if v is not None})
+    if options.all_frames:
+        settings = replace(settings, frames=None)
+    opened = open_benchmark(
+        options.benchmark,
+        options.root,
+        settings,
+        layout=options.layout,
+        sequences=options.sequences,
+        allow_missing=options.allow_missing,
+    )
+    _note(opened.report.summary())
+    for name in opened.missing:
+        _note(f"missing: {name}")
+    return opened
+
+
+def _scoring(options: argparse.Namespace, temporal: bool) -> Scoring:
+    if options.all_pixels:
+        return Scoring(options.fit, ALL_PIXELS, ALL_PIXELS, temporal)
+    return Scoring(options.fit, temporal=temporal)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    opened = _open(options)
+    results = evaluate(
+        opened,
+        _method(options),
+        _scoring(options, options.temporal),
+        allow_missing=options.allow_missing,
+        note=_note,
+    )
+    results = {**_provenance(options), **results}
+    table = write_results(results, options.out, _title(opened), options.ablations)
+    return _finish(text_table(table), results, options.out)
+
+
+def _long(options: argparse.Namespace) -> int:
+    lengths = options.lengths or LENGTHS
+    opened = _open(options, max(lengths))
+    results = long_sequences(
+        opened,
+        _method(options),
+        lengths,
+        _scoring(options, False),
+        allow_missing=options.allow_missing,
+        note=_note,
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    results = {**_provenance(options), **results}
+    write_json(options.out / "results.json", results)
+    write_lengths(results, options.out, _title(opened))
+    return _finish(text_table(length_table(results)), results, options.out)
+
+
+def _provenance(options: argparse.Namespace) -> dict[str, Any]:
+    """What was asked for, as JSON can hold it."""
+    plain = {k: v for k, v in vars(options).items() if k != "run"}
+    return {"options": {k: str(v) if isinstance(v, Path) else v for k, v in plain.items()}}
+
+
+def _title(opened: Opened) -> str:
+    count = len(opened.sequences)
+    return f"{opened.benchmark.title}, {count} sequence{'s' if count != 1 else ''}"
+
+
+def _finish(table: str, results: dict[str, Any], out: Path) -> int:
+    print(table)
+    print(f"written to {out}")
+    for name in results["missing"]:
+        _note(f"not scored: {name}")
+    return PARTIAL if results["missing"] else COMPLETE
+
+
+def _note(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="dyfn-eval", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    command = commands.add_parser("list", help="the benchmarks: layout, frames, cap, crop")
+    command.set_defaults(run=_list)
+    command = commands.add_parser("run", help="score a model, with its controls")
+    _add_benchmark(command)
+    _add_model(command, required=True)
+    _add_tables(command)
+    command = commands.add_parser("score", help="score predictions from files")
+    _add_benchmark(command)
+    _add_predictions(command, required=True)
+    _add_tables(command)
+    command = commands.add_parser(
+        "long", help="error against length, the alignment solved anew at every length"
+    )
+    _add_benchmark(command)
+    source = command.add_argument_group("what is scored (one of --model and --predictions)")
+    either = source.add_mutually_exclusive_group(required=True)
+    either.add_argument("--model", help="checkpoint, Hub id or dyfn-mini")
+    either.add_argument("--predictions", type=Path, metavar="DIR", help="see dyfn-eval score")
+    _add_model(command, required=False)
+    _add_predictions(command, required=False)
+    command.add_argument(
+        "--lengths", type=int, nargs="+", metavar="N", help="frames (default: 100 200 300 400 500)"
+    )
+    command.set_defaults(run=_long)
+    return parser
+
+
+def _add_benchmark(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--benchmark", required=True, help="a name of `dyfn-eval list`")
+    command.add_argument("--root", type=Path, required=True, help="folder of the data set")
+    command.add_argument("--out", type=Path, required=True, help="folder for the results")
+    command.add_argument("--name", help="of the method in tables")
+    group = command.add_argument_group("what is scored of it (default: as in the paper)")
+    group.add_argument("--layout", choices=LAYOUTS, default=AUTO, help="default: found out")
+    group.add_argument("--sequences", nargs="+", default=[], metavar="NAME", help="only these")
+    group.add_argument("--allow-missing", action="store_true", help="score what is there")
+    group.add_argument("--first", type=int, help="frames left out at the start")
+    group.add_argument("--stride", type=int, help="every so-many-th frame")
+    group.add_argument("--frames", type=int, help="at most so many of a sequence")
+    group.add_argument("--all-frames", action="store_true", help="no limit")
+    group.add_argument("--depth-max", type=float, metavar="METRES", help="cap of the truth")
+    group.add_argument(
+        "--crop", type=int, nargs=2, metavar=("ROWS", "COLUMNS"), help="cut off at each side"
+    )
+    group = command.add_argument_group("how it is scored")
+    group.add_argument(
+        "--fit", choices=FITS, default=L1, help="alignment: weighted L1 (paper), least squares"
+    )
+    group.add_argument(
+        "--all-pixels",
+        action="store_true",
+        help="every pixel, in memory that grows; default: a grid of at most 20000 a frame",
+    )
+
+
+def _add_model(command: argparse.ArgumentParser, required: bool) -> None:
+    group = command.add_argument_group("model")
+    if required:
+        group.add_argument("--model", required=True, help="checkpoint, Hub id or dyfn-mini")
+    group.add_argument(
+        "--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone"
+    )
+    group.add_argument(
+        "--no-controls",
+        dest="controls",
+        action="store_false",
+        help="leave out the moving average and the frozen statistics",
+    )
+    group.add_argument("--num-tokens", type=int, help="how finely to look")
+    group.add_argument(
+        "--known-camera", action="store_true", help="tell the model the benchmark's intrinsics"
+    )
+    group.add_argument("--device", default="cpu", help="of torch (default: cpu)")
+
+
+def _add_predictions(command: argparse.ArgumentParser, required: bool) -> None:
+    group = command.add_argument_group("predictions")
+    if required:
+        group.add_argument(
+            "--predictions",
+            type=Path,
+            required=True,
+            metavar="DIR",
+            help="SEQUENCE.npz, SEQUENCE.npy (T x H x W), or SEQUENCE/ with one .npz, .npy, 16-bit "
+            ".png or .exr a frame",
+        )
+    group.add_argument(
+        "--quantity",
+        choices=QUANTITIES,
+        required=required,
+        default=None if required else QUANTITIES[0],
+        help="depth; disparity: a / depth + b; inverse: a / depth",
+    )
+    group.add_argument("--scale", type=float, help="stored values per unit; needed for .png")
+    group.add_argument("--key", help="of the array in .npz files that hold several")
+
+
+def _add_tables(command: argparse.ArgumentParser) -> None:
+    group = command.add_argument_group("tables")
+    group.add_argument(
+        "--no-temporal", dest="temporal", action="store_false", help="no TAE, no flicker"
+    )
+    group.add_argument("--ablations", action="store_true", help="the paper's ablations too")
+    command.set_defaults(run=_evaluate)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

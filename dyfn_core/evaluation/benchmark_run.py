@@ -1,0 +1,235 @@
+"""A method on the sequences of a benchmark: all protocols, all measures, the controls beside it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Opened
+from dyfn_core.evaluation.predictions import Method, Predict
+from dyfn_core.evaluation.protocols import (
+    CONTROLS,
+    L1,
+    SequenceScore,
+    SequenceScorer,
+    predicted,
+    spread,
+    to_shape,
+)
+from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
+from dyfn_core.prediction import DEPTH
+
+PROTOCOLS = ("image", "video", "metric")
+PACKAGES = ("dyfn_ros", "numpy", "torch", "opencv-python-headless")
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Scoring:
+    """How frames are scored; see SequenceScorer. temporal: also measure TAE and flicker."""
+
+    fit: str = L1
+    samples_per_frame: int = 20_000
+    max_samples: int = 4_000_000
+    temporal: bool = True
+
+    def scorer(self, depth_max: float, quantity: str) -> SequenceScorer:
+        """An empty scorer of these options."""
+        return SequenceScorer(
+            depth_max, self.samples_per_frame, self.max_samples, quantity, self.fit
+        )
+
+
+class VariantScorers:
+    """The scorers of a sequence: one per variant of the method and one per control."""
+
+    def __init__(self, method: Method, depth_max: float, scoring: Scoring) -> None:
+        self.method = method
+        self.scorers = {v: scoring.scorer(depth_max, method.quantity) for v in method.variants}
+        self.scorers |= {f"control: {c}": scoring.scorer(depth_max, DEPTH) for c in CONTROLS}
+
+    def push(self, found: Mapping[str, np.ndarray], truth: np.ndarray) -> dict[str, np.ndarray]:
+        """One frame's predictions by variant; returns all maps that were scored, at truth's size.
+
+        The controls are scored where the method's first variant says something.
+        Raises ValueError when a prediction has another aspect ratio than truth.
+        """
+        maps = {name: to_shape(found[name], truth.shape) for name in self.method.variants}
+        valid = predicted(maps[self.method.variants[0]], self.method.quantity)
+        for name, control in CONTROLS.items():
+            values = control((truth.shape[0], truth.shape[1]))
+            maps[f"control: {name}"] = np.where(valid, values, np.float32(np.nan))
+        for name, values in maps.items():
+            self.scorers[name].push(values, truth)
+        return maps
+
+
+def score_sequence(
+    sequence: BenchmarkSequence, method: Method, depth_max: float, scoring: Scoring
+) -> dict[str, Any]:
+    """Everything about one sequence, as plain values.
+
+    Raises FrameError or DataError, naming the file or sequence and what was expected.
+    """
+    scorers = VariantScorers(method, depth_max, scoring)
+    with TemporalScorer() as temporal:
+        frames = _push_all(sequence, method.open(sequence), scorers, temporal, scoring, depth_max)
+        variants = {name: _summary(scorer) for name, scorer in scorers.scorers.items()}
+        steadiness: dict[str, Any] = {}
+        if scoring.temporal:
+            steadiness = temporal.results(
+                {
+                    name: (found["alignment"]["scale"], found["alignment"]["shift"], s.quantity)
+                    for (name, found), s in zip(
+                        variants.items(), scorers.scorers.values(), strict=True
+                    )
+                    if found["alignment"] is not None
+                }
+            )
+    for name, found in variants.items():
+        found["temporal"] = steadiness.get(name)
+    return {
+        "name": sequence.name,
+        "frames": frames,
+        "available_frames": sequence.available,
+        "first": sequence.numbers[0],
+        "last": sequence.numbers[-1],
+        "temporal_truth": steadiness.get(TRUTH),
+        "variants": variants,
+    }
+
+
+def _push_all(
+    sequence: BenchmarkSequence,
+    predict: Predict,
+    scorers: VariantScorers,
+    temporal: TemporalScorer,
+    scoring: Scoring,
+    depth_max: float,
+) -> int:
+    count = 0
+    for count, frame in enumerate(sequence.frames(), start=1):
+        found = predict(count - 1, frame)
+        try:
+            maps = scorers.push(found, frame.truth)
+        except ValueError as error:
+            raise FrameError(f"{sequence.name}, frame {count - 1}: {error}") from error
+        if scoring.temporal:
+            truth = np.where(frame.truth <= depth_max, frame.truth, np.float32(np.nan))
+            temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
+    return count
+
+
+def _summary(scorer: SequenceScorer) -> dict[str, Any]:
+    scores = {"image": scorer.image(), "video": scorer.video(), "metric": scorer.metric()}
+    video = scores["video"]
+    scored = [frame.coverage for frame in scorer.frames if frame.metrics is not None]
+    return {
+        **{name: _metrics(score) for name, score in scores.items()},
+        "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
+        "coverage": float(np.mean(scored)) if scored else None,
+        "scored_frames": len(scored),
+        "spread": spread(scorer.frames),
+    }
+
+
+def _metrics(score: SequenceScore | None) -> dict[str, float] | None:
+    return None if score is None else score.metrics
+
+
+def evaluate(
+    opened: Opened,
+    method: Method,
+    scoring: Scoring | None = None,
+    *,
+    allow_missing: bool = False,
+    note: Note = lambda line: None,
+) -> dict[str, Any]:
+    """All sequences and their means, as plain values: what results.json holds.
+
+    allow_missing: a sequence that cannot be scored is listed under `missing` and the others go on;
+    otherwise its error ends it. note: is told a line a sequence. Raises DataError when no sequence
+    could be scored.
+    """
+    scoring = scoring or Scoring()
+    done, missing = [], list(opened.missing)
+    for sequence in opened.sequences:
+        try:
+            found = score_sequence(sequence, method, opened.settings.depth_max, scoring)
+        except (FrameError, DataError) as error:
+            if not allow_missing:
+                raise
+            missing.append(f"{sequence.name}: {error}")
+            note(f"{sequence.name}: not scored: {error}")
+            continue
+        done.append(found)
+        note(_line(found))
+    if not done:
+        raise DataError(f"no sequence could be scored: {'; '.join(missing)}")
+    return {
+        "benchmark": opened.benchmark.name,
+        "layout": opened.layout,
+        "settings": plain_settings(opened),
+        "scoring": asdict(scoring),
+        "quantity": method.quantity,
+        "versions": versions(),
+        "missing": missing,
+        "problems": opened.report.problems,
+        "frames": sum(found["frames"] for found in done),
+        "variants": mean_of([found["variants"] for found in done]),
+        "temporal_truth": mean_of([found["temporal_truth"] for found in done]),
+        "sequences": done,
+    }
+
+
+def plain_settings(opened: Opened) -> dict[str, Any]:
+    """The settings as JSON can hold them: no cap is None."""
+    settings = asdict(opened.settings)
+    settings["crop"] = list(opened.settings.crop)
+    if not np.isfinite(settings["depth_max"]):
+        settings["depth_max"] = None
+    return settings
+
+
+def versions() -> dict[str, str]:
+    """Python's and those of the packages that numbers depend on."""
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def mean_of(trees: list[Any]) -> Any:
+    """The mean over sequences of equal trees of numbers; a number that one lacks is left out of
+    its mean, and is None where all lack it. Counts (integers) are summed."""
+    known = [tree for tree in trees if tree is not None]
+    if not known:
+        return None
+    if isinstance(known[0], dict):
+        names = dict.fromkeys(name for tree in known for name in tree)
+        return {name: mean_of([tree.get(name) for tree in known]) for name in names}
+    if all(isinstance(value, int) for value in known):
+        return sum(known)
+    return float(np.mean(known))
+
+
+def _line(found: dict[str, Any]) -> str:
+    name, first = next(iter(found["variants"].items()))
+    scores = []
+    for protocol in ("image", "video"):
+        metrics = first[protocol]
+        scores.append(
+            f"{protocol} not scored"
+            if metrics is None
+            else f"{protocol} {metrics['abs_rel']:.3f} / {metrics['delta1']:.3f}"
+        )
+    return f"{found['name']}: {found['frames']} frames, {name}: {', '.join(scores)}"

@@ -1,0 +1,23 @@
+"""ScanNet's test split, exported: 100 scenes of a hand-held sensor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dyfn_core.data.frames import DataReport
+from dyfn_core.evaluation.benchmarks.base import Settings, Source
+from dyfn_core.evaluation.benchmarks.rgbd import rgbd_sources
+
+EXPECTED = (
+    "<scene>/ with color/0.jpg, depth/0.png, pose/0.txt and intrinsic/intrinsic_color.txt "
+    "(or the scenes in scans_test/)"
+)
+# 90 of the first 270 frames. The colour image is brought to the depth's size before the crop.
+SETTINGS = Settings(stride=3, frames=90, depth_max=10, crop=(8, 11))
+SCENES = tuple(f"scene{number:04}_00" for number in range(707, 807))
+LENGTHS = dict.fromkeys(SCENES, 90)
+
+
+def open_scannet(root: Path, report: DataReport) -> list[Source]:
+    """uint16 millimetres, 0 invalid; colour 1296 x 968 is resized to the depth's 640 x 480."""
+    return rgbd_sources(root, "color", report, named=lambda folder: folder.name)

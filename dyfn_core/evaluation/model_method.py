@@ -1,0 +1,93 @@
+"""A model scored as it runs live, through DepthStream, with the controls of its latent."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, BenchmarkSequence
+from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
+from dyfn_core.evaluation.predictions import Predict
+from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.stabilizer import Stabilizer
+from dyfn_core.prediction import DISPARITY, Prediction
+from dyfn_core.stream import DepthStream
+
+
+class ModelMethod:
+    """predictions.Method of a model: with DyFN, without, and with the statistics controls.
+
+    stabilize: False leaves the DyFN variant out. controls: False leaves the moving average and the
+    frozen statistics out. num_tokens: None for the model's default. known_camera: tell the stream
+    the benchmark's intrinsics; otherwise, as in the paper, it finds the focal length itself.
+    The image is encoded once for all variants; each has a DepthStream of its own.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        model: GeometryModel,
+        *,
+        stabilize: bool = True,
+        controls: bool = True,
+        num_tokens: int | None = None,
+        known_camera: bool = False,
+    ) -> None:
+        self.model = model
+        self.num_tokens = num_tokens
+        self.known_camera = known_camera
+        self._stabilizers: dict[str, Stabilizer | None] = {}
+        if stabilize and model.stabilizer is not None:
+            self._stabilizers[f"{name} + DyFN"] = model.stabilizer
+        self._stabilizers[f"{name}, base"] = None
+        if controls:
+            channels = model.latent_channels
+            self._stabilizers["control: ema"] = ema_control(channels).to(model.device)
+            self._stabilizers["control: frozen"] = frozen_control(channels).to(model.device)
+
+    @property
+    def quantity(self) -> str:
+        """See predictions.Method."""
+        return self.model.quantity
+
+    @property
+    def variants(self) -> tuple[str, ...]:
+        """See predictions.Method."""
+        return tuple(self._stabilizers)
+
+    def open(self, sequence: BenchmarkSequence) -> Predict:
+        """See predictions.Method; every sequence begins with fresh streams."""
+        streams: dict[str, DepthStream] = {}
+
+        @torch.inference_mode()
+        def predict(index: int, frame: BenchmarkFrame) -> dict[str, np.ndarray]:
+            if not streams:
+                streams.update(self._streams(frame))
+            image = torch.from_numpy(np.ascontiguousarray(frame.image)).permute(2, 0, 1)[None]
+            latent = self.model.encode(image.to(self.model.device).float() / 255, self.num_tokens)
+            found = {}
+            for name, stream in streams.items():
+                with stabilized_by(self.model, self._stabilizers[name]):
+                    changed, state = self.model.stabilize_latent(latent, stream.memory.state)
+                affine = self.model.decode(changed)
+                found[name] = as_array(stream.finish(affine, state, float(index)))
+            return found
+
+        return predict
+
+    def _streams(self, frame: BenchmarkFrame) -> dict[str, DepthStream]:
+        matrix = frame.camera_matrix if self.known_camera else None
+        made = {}
+        for name, stabilizer in self._stabilizers.items():
+            with stabilized_by(self.model, stabilizer):
+                made[name] = DepthStream(self.model, matrix, num_tokens=self.num_tokens)
+        return made
+
+
+def as_array(prediction: Prediction) -> np.ndarray:
+    """H x W float32: depth, or disparity of a disparity model; NaN where the mask is False."""
+    values = prediction.depth
+    if prediction.quantity == DISPARITY and prediction.disparity is not None:
+        values = prediction.disparity
+    array = values.float().cpu().numpy()
+    return np.where(prediction.mask.cpu().numpy(), array, np.float32(np.nan))

@@ -1,0 +1,160 @@
+"""Small copies of the public benchmarks in their exact formats, of known values."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+PATCH = (slice(2, 6), slice(3, 9))  # pixels without truth
+
+
+def depth(index: int, size: tuple[int, int]) -> np.ndarray:
+    """Metres, float64: a slope that differs from frame to frame."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    return 2 + 0.1 * index + columns / size[1] + 2 * rows / size[0]
+
+
+def image(index: int, size: tuple[int, int]) -> np.ndarray:
+    """H x W x 3 uint8 RGB whose channels differ: red the frame's number, green and blue ramps."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    picture = np.zeros((*size, 3), np.uint8)
+    picture[..., 0] = 40 + 20 * (index % 10)
+    picture[..., 1] = 200 * columns // size[1]
+    picture[..., 2] = 100 * rows // size[0]
+    return picture
+
+
+def pose(index: int) -> np.ndarray:
+    """A camera that moves to the right and forward."""
+    result = np.eye(4)
+    result[:3, 3] = [0.1 * index, 0, 0.05 * index]
+    return result
+
+
+def write_image(path: Path, picture: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else []
+    assert cv2.imwrite(str(path), picture[..., ::-1], quality)
+
+
+def write_depth(path: Path, metres: np.ndarray, unit: float, invalid: int = 0) -> None:
+    """16-bit PNG of `unit` values a metre, PATCH invalid."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stored = np.round(metres * unit).astype(np.uint16)
+    stored[PATCH] = invalid
+    assert cv2.imwrite(str(path), stored)
+
+
+def write_matrix(path: Path, matrix: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, matrix)
+
+
+def write_dpt(path: Path, metres: np.ndarray) -> None:
+    """Sintel's depth: tag, width, height, float32 data; 1e11 in PATCH, as its sky."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = metres.astype("<f4")
+    values[PATCH] = 1e11
+    header = struct.pack("<fii", 202021.25, metres.shape[1], metres.shape[0])
+    path.write_bytes(header + values.tobytes())
+
+
+def write_cam(path: Path, matrix: np.ndarray, camera_to_world: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    world_to_camera = np.linalg.inv(camera_to_world)[:3]
+    values = np.concatenate([matrix.ravel(), world_to_camera.ravel()]).astype("<f8")
+    path.write_bytes(struct.pack("<f", 202021.25) + values.tobytes())
+
+
+SINTEL_SIZE = (28, 64)
+SINTEL_MATRIX = np.array([[70.0, 0, 31.5], [0, 70, 13.5], [0, 0, 1]])
+
+
+def make_sintel(root: Path, lengths: dict[str, int]) -> None:
+    base = root / "training"
+    for name, frames in lengths.items():
+        for i in range(frames):
+            for kind in ("clean", "final"):
+                path = base / kind / name / f"frame_{i + 1:04}.png"
+                write_image(path, image(i + (kind == "final"), SINTEL_SIZE))
+            write_dpt(base / "depth" / name / f"frame_{i + 1:04}.dpt", depth(i, SINTEL_SIZE))
+            camera = base / "camdata_left" / name / f"frame_{i + 1:04}.cam"
+            write_cam(camera, SINTEL_MATRIX, pose(i))
+
+
+SCANNET_COLOUR, SCANNET_DEPTH = (242, 324), (120, 160)  # as 968 x 1296 and 480 x 640
+SCANNET_CAMERA = (292.5, 293.0, 161.0, 121.0)  # of the colour image
+
+
+def make_scannet(root: Path, scene: str, frames: int) -> None:
+    """Frame 3 has a pose of -inf, as ScanNet's lost frames do."""
+    folder = root / scene
+    matrix = np.eye(4)
+    matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2] = SCANNET_CAMERA
+    write_matrix(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    for i in range(frames):
+        write_image(folder / "color" / f"{i}.jpg", image(i, SCANNET_COLOUR))
+        write_depth(folder / "depth" / f"{i}.png", depth(i, SCANNET_DEPTH), 1000)
+        where = np.full((4, 4), -np.inf) if i == 3 else pose(i)
+        write_matrix(folder / "pose" / f"{i}.txt", where)
+
+
+KITTI_SIZE = (30, 80)
+
+
+def make_kitti(root: Path, drive: str, numbers: range) -> None:
+    """Images from 0 on, truth only for `numbers`, as the first and last five have none."""
+    date = drive[:10]
+    for n in range(numbers.stop + 5):
+        path = root / date / drive / "image_02" / "data" / f"{n:010}.png"
+        write_image(path, image(n % 5, KITTI_SIZE))
+    for n in numbers:
+        path = root / "val" / drive / "proj_depth/groundtruth/image_02" / f"{n:010}.png"
+        write_depth(path, depth(n, KITTI_SIZE), 256)
+    numbers_of_p = "90.0 0 39.5 4.4 0 91.0 14.5 0.2 0 0 1 0.003"
+    (root / date / "calib_cam_to_cam.txt").write_text(
+        f"calib_time: 09-Jan-2012\nP_rect_02: {numbers_of_p}\n"
+    )
+
+
+TUM_SIZE = (24, 32)
+
+
+def make_tum(folder: Path, frames: int, lost_depth: int | None = None) -> None:
+    """TUM's layout, also Bonn's; depth lags by 4 ms, and one depth image may be lost."""
+    lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for i in range(frames):
+        stamp, later = 1311868164 + i / 30, 1311868164 + i / 30 + 0.004
+        write_image(folder / f"rgb/{stamp:.6f}.png", image(i % 5, TUM_SIZE))
+        lists["rgb"].append(f"{stamp:.6f} rgb/{stamp:.6f}.png")
+        if i != lost_depth:
+            write_depth(folder / f"depth/{later:.6f}.png", depth(i, TUM_SIZE), 5000)
+            lists["depth"].append(f"{later:.6f} depth/{later:.6f}.png")
+        x, _, z = pose(i)[:3, 3]
+        lists["groundtruth"].append(f"{stamp:.4f} {x} 0 {z} 0 0 0 1")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(["# a comment", *lines]) + "\n")
+
+
+def make_seven_scenes(folder: Path, frames: int) -> None:
+    for i in range(frames):
+        write_image(folder / f"frame-{i:06}.color.png", image(i, (24, 32)))
+        write_depth(folder / f"frame-{i:06}.depth.png", depth(i, (24, 32)), 1000, invalid=65535)
+        write_matrix(folder / f"frame-{i:06}.pose.txt", pose(i))
+
+
+def make_video(folder: Path, name: str, frames: int, size: tuple[int, int] = (48, 64)) -> None:
+    """DepthCrafter's pair of files; truth of half the video's size, -1 where it is invalid."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{name}_rgb_left.mp4"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 15, (size[1], size[0]))
+    assert video.isOpened()
+    for i in range(frames):
+        video.write(image(i, size)[..., ::-1])
+    video.release()
+    truth = np.stack([depth(i, (size[0] // 2, size[1] // 2)) for i in range(frames)])[:, None]
+    truth[:, :, PATCH[0], PATCH[1]] = -1
+    np.savez(folder / f"{name}_disparity.npz", disparity=truth)
