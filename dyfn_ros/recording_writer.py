@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+import apsw
 import cv2
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+
+from dyfn_ros.finished_file import OutputError, cannot_write
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -94,8 +99,12 @@ class RecordingWriter:
             self.discard()
 
     def close(self) -> None:
-        """Finish the recording and move it to its path."""
-        self._writer.close()
+        """Finish the recording and move it to its path. Raises OutputError, and leaves nothing."""
+        try:
+            self._writer.close()
+        except WRITE_ERRORS as error:
+            self.discard()
+            raise _full(self.path, error) from error
         folder = self._partial / self.path.stem
         source = next(folder.glob(f"*{self.path.suffix}")) if self._bare else folder
         if self.path.is_dir():
@@ -105,8 +114,9 @@ class RecordingWriter:
 
     def discard(self) -> None:
         """Drop everything written so far; an older recording at the path stays."""
-        self._writer.close()
-        shutil.rmtree(self._partial)
+        with suppress(Exception):  # whatever a full disk does here must not hide the first error
+            self._writer.close()
+        shutil.rmtree(self._partial, ignore_errors=True)
 
     def write(self, topic: str, kind: str, message: object, stamp_ns: int) -> None:
         """Write a message of type `kind` (such as "sensor_msgs/msg/Image") as logged at stamp_ns.
@@ -123,7 +133,10 @@ class RecordingWriter:
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise RecordingError(f"topic {topic} holds {connection.msgtype}, not {kind}")
-        self._writer.write(connection, stamp_ns, data)
+        try:
+            self._writer.write(connection, stamp_ns, data)
+        except WRITE_ERRORS as error:
+            raise _full(self.path, error) from error
 
     def write_image(self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str) -> None:
         """image: H x W x 3 uint8 RGB, written raw as rgb8."""
@@ -214,6 +227,15 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 POSE = "geometry_msgs/msg/PoseStamped"
 TF = "tf2_msgs/msg/TFMessage"
+FLOAT = "std_msgs/msg/Float64"
+
+
+# What rosbags' storages raise when the disk is full or gone.
+WRITE_ERRORS = (OSError, sqlite3.Error, apsw.Error)
+
+
+def _full(path: Path, error: Exception) -> OutputError:
+    return cannot_write(path, error if isinstance(error, OSError) else OSError(str(error)))
 
 
 def write_rgbd_recording(

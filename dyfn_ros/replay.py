@@ -10,13 +10,11 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.pictures import encode_picture
@@ -28,8 +26,17 @@ from dyfn_core.evaluation.sequence import (
     score_table,
 )
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
+from dyfn_ros.finished_file import finished_file
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.replay_recording import ReplayRecording
+from dyfn_ros.replay_outputs import (
+    DEFAULT,
+    FILES,
+    VOXEL,
+    OutputOptions,
+    ReplayOutputs,
+    parse_outputs,
+)
+from dyfn_ros.replay_video import Alignment
 from dyfn_ros.scene_cut import SceneCutHook
 
 if TYPE_CHECKING:
@@ -58,7 +65,10 @@ class Options:
     depth_max: float = math.inf
     tolerance: float = 0.02
     scene_cut_threshold: float = 0.0
-    output_recording: bool = True
+    write: tuple[str, ...] = DEFAULT
+    pose_topic: str | None = None
+    voxel: float = VOXEL
+    progress: bool = True
 
 
 def parse(arguments: Sequence[str] | None = None) -> Options:
@@ -90,8 +100,30 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
         default=0.0,
         help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
     )
-    add("--no-output-recording", dest="output_recording", action="store_false")
+    _add_output_options(parser)
     return Options(**vars(parser.parse_args(arguments)))
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--write",
+        type=_outputs,
+        default=DEFAULT,
+        metavar="LIST",
+        help=f"files beside scores and report: some of {','.join(FILES)}, or none "
+        f"(default: {','.join(DEFAULT)})",
+    )
+    add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
+    add("--pose-topic", help='poses, odometry or TF for cloud.ply; "none" for no cloud')
+    add("--voxel", type=_distance, default=VOXEL, help="voxels of cloud.ply, metres")
+
+
+def _outputs(text: str) -> tuple[str, ...]:
+    try:
+        return parse_outputs(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _positive(text: str) -> int:
@@ -153,11 +185,10 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
     camera = CameraStream(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
-    with ExitStack() as stack:
-        writer = None
-        if options.output_recording:
-            writer = stack.enter_context(ReplayRecording(options.out / "output.mcap"))
-        for frame in tqdm(frames, total=expected, unit="frame", file=sys.stderr):
+    with _outputs_of(options, recording) as outputs:
+        for frame in tqdm(
+            frames, total=expected, unit="frame", file=sys.stderr, disable=not options.progress
+        ):
             start = time.perf_counter()
             seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
             stamp = seconds + nanoseconds * 1e-9
@@ -175,22 +206,29 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
             latency = time.perf_counter() - start
             try:
                 # Disparity is aligned as such, also where its inverse is too far to be depth.
-                said, valid = geometry.depth, geometry.valid
-                if geometry.disparity is not None:
-                    said, valid = geometry.disparity, np.isfinite(geometry.disparity)
-                evaluation.push(
+                score = evaluation.push(
                     frame.image,
-                    said,
-                    valid,
+                    *geometry.said,
                     frame.depth,
                     stamp=stamp,
                     latency=latency,
                 )
             except ValueError as error:
                 raise RecordingError(f"{recording.topics.depth}: {error}") from error
-            if writer is not None:
-                writer.write(frame, geometry)
+            outputs.write(frame, geometry, score)
+        video, quantity = evaluation.video(), model.quantity
+        alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
+        outputs.finish(alignment, quantity)
     return evaluation
+
+
+def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
+    chosen = OutputOptions(options.write, options.pose_topic, options.voxel, options.depth_max)
+
+    def warn(reason: str) -> None:
+        recording.notes.warnings[reason] += 1
+
+    return ReplayOutputs(options.out, options.recording, chosen, warn)
 
 
 def _write_results(
@@ -218,13 +256,14 @@ def _write_results(
         },
     }
     strip = evaluation.draw_strip()
-    (options.out / "strip.png").write_bytes(encode_picture(strip))
-    _write_rows(options.out / "frames.csv", evaluation)
+    with finished_file(options.out / "strip.png") as partial:
+        partial.write_bytes(encode_picture(strip))
+    with finished_file(options.out / "frames.csv") as partial:
+        _write_rows(partial, evaluation)
     _write_report(options, metrics, evaluation, Picture(strip, "input, truth, depth, error"))
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
-    partial = options.out / "metrics.json.partial"
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(options.out / "metrics.json")
+    with finished_file(options.out / "metrics.json") as partial:
+        partial.write_text(text, encoding="utf-8")
     return metrics
 
 
@@ -298,7 +337,9 @@ def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> 
             )
     print(f"{metrics['frames']} frames of {options.recording}")
     print(text_table(score_table({run_name(metrics): metrics})))
-    print(f"results in {options.out} (report.html, metrics.json, frames.csv, output.mcap)")
+    written = [name for name in FILES.values() if (options.out / name).exists()]
+    listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
+    print(f"results in {options.out}: {listed}")
     return PARTIAL if notes["losses"] else ALL
 
 
