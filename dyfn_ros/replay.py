@@ -71,16 +71,37 @@ class Options:
     progress: bool = True
 
 
-def parse(arguments: Sequence[str] | None = None) -> Options:
-    """Command line -> Options; ends the process with code 2 on a wrong one."""
+@dataclass(frozen=True)
+class Command:
+    """options: of every recording (its own is the first). recordings: as they were given.
+
+    jobs, ray: see fleet.FleetOptions.
+    """
+
+    options: Options
+    recordings: tuple[Path, ...]
+    jobs: int
+    ray: str | None
+
+
+def parse(arguments: Sequence[str] | None = None) -> Command:
+    """Command line -> Command; ends the process with code 2 on a wrong one."""
     parser = argparse.ArgumentParser(
         prog="dyfn-replay",
-        description="Run a recording through the model, as the node would, and score it.",
+        description="Run recordings through the model, as the node would, and score them.",
         epilog="Exit code: 0 everything was read, 3 part of the recording was damaged and the "
-        "rest was used, 2 nothing usable (the reason is on stderr).",
+        "rest was used, 2 nothing usable (the reason is on stderr). Of several recordings: 0 all "
+        "are whole, 3 some are partial or failed, 2 none gave results.",
     )
     add = parser.add_argument
-    add("recording", type=Path, help="rosbag2 folder, .mcap or .db3 file, or RGB-D folder")
+    add(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="recording",
+        help="rosbag2 folder, .mcap or .db3 file, RGB-D folder; several, a folder of them, or a "
+        ".txt file that lists them",
+    )
     add("--out", type=Path, required=True, help="folder for the results")
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
     add("--image-topic", help="colour image, raw or compressed")
@@ -101,7 +122,11 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
         help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
     )
     _add_output_options(parser)
-    return Options(**vars(parser.parse_args(arguments)))
+    add("--jobs", type=_positive, default=1, help="processes for several recordings")
+    add("--ray", metavar="ADDRESS", help='Ray cluster for several recordings; "local" makes one')
+    given = vars(parser.parse_args(arguments))
+    recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
+    return Command(Options(recordings[0], **given), tuple(recordings), jobs, ray)
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
@@ -319,15 +344,25 @@ def run_name(metrics: dict[str, Any]) -> str:
 def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> int:
     """-> exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    options = parse(arguments)
+    command = parse(arguments)
     try:
-        metrics = replay(options, loader)
+        return _replay_command(command, loader)
     except (RecordingError, ValueError, OSError) as error:
         print(f"dyfn-replay: {error}", file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
-        print("dyfn-replay: interrupted, nothing was written", file=sys.stderr)
+        print("dyfn-replay: interrupted, unfinished results were not written", file=sys.stderr)
         return 130
+
+
+def _replay_command(command: Command, loader: ModelLoader) -> int:
+    from dyfn_ros import fleet  # which is above this module
+
+    options = command.options
+    if fleet.is_many(command.recordings):
+        chosen = fleet.FleetOptions(command.jobs, command.ray)
+        return fleet.replay_all(fleet.expand(command.recordings), options, chosen, loader)
+    metrics = replay(options, loader)
     notes = metrics["recording"]
     for kind in ("losses", "warnings"):
         for text, count in notes[kind].items():
