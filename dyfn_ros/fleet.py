@@ -36,7 +36,7 @@ FREE_OPTIONS = ("recording", "out", "progress", "threads")
 
 @dataclass(frozen=True)
 class FleetOptions:
-    """jobs: worker processes. ray: a cluster's address, "local" for one made here, None without."""
+    """jobs: worker processes here. ray: a cluster's address, "local" for one made here, or None."""
 
     jobs: int = 1
     ray: str | None = None
@@ -195,7 +195,7 @@ def _runner(fleet: FleetOptions) -> Runner:
     if fleet.ray is not None:
         from dyfn_ros.fleet_ray import ray_runner
 
-        return ray_runner(fleet.ray)
+        return ray_runner(fleet.ray, fleet.jobs)
     return lambda jobs, loader: run_locally(jobs, loader, fleet.jobs)
 
 

@@ -12,7 +12,7 @@ from dyfn_ros.replay import ModelLoader
 LOCAL = "local"  # Ray's own word for a cluster of this machine, made for this run
 
 
-def ray_runner(address: str) -> Runner:
+def ray_runner(address: str, jobs: int = 1) -> Runner:
     """A runner for the cluster at `address` ("auto", "HOST:PORT", "ray://HOST:PORT" or "local").
 
     Its machines must have this package installed and see the recordings, the output folder and
@@ -26,13 +26,18 @@ def ray_runner(address: str) -> Runner:
             f"--ray needs Ray ({error}): install this package with its `ray` extra"
         ) from error
 
-    def run(jobs: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
-        if not jobs:
+    def run(waiting: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
+        if not waiting:
             return
-        ours: dict[str, Any] = {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+        cpus = jobs * max(job.options.threads or 1 for job in waiting)
+        ours: dict[str, Any] = {
+            "num_cpus": cpus,
+            "include_dashboard": False,
+            "_node_ip_address": "127.0.0.1",
+        }
         ray.init(address, log_to_driver=False, **(ours if address == LOCAL else {}))
         try:
-            yield from _outcomes(ray, jobs, loader)
+            yield from _outcomes(ray, waiting, loader)
         finally:
             ray.shutdown()
 
