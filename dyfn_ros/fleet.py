@@ -122,7 +122,7 @@ def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Jo
     jobs: list[Job] = []
     taken: set[str] = set()
     for recording in recordings:
-        path = recording.resolve()
+        path = recording.absolute()  # a link keeps its own name
         match = RECORDING_FILE.fullmatch(path.name)
         name = path.name if match is None or path.is_dir() else match["name"]
         name = name if name not in taken else f"{path.parent.name}_{name}"
@@ -130,7 +130,7 @@ def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Jo
         while free in taken:
             number, free = number + 1, f"{name}-{number}"
         taken.add(free)
-        own = replace(options, recording=path, out=options.out.resolve() / free, progress=False)
+        own = replace(options, recording=path, out=options.out.absolute() / free, progress=False)
         own = replace(own, threads=options.threads or 1)
         jobs.append(Job(free, own, _key(own, checksum)))
     return jobs

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import logging
 import math
 import sys
@@ -17,16 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.report import Picture, Section, Table, Text, text_table, write_report
-from dyfn_core.evaluation.sequence import (
-    COLUMNS,
-    SequenceEvaluation,
-    curve_picture,
-    score_table,
-)
+from dyfn_core.evaluation.report import text_table
+from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
-from dyfn_ros.finished_file import finished_file
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
 from dyfn_ros.replay_outputs import (
     DEFAULT,
@@ -36,6 +27,7 @@ from dyfn_ros.replay_outputs import (
     ReplayOutputs,
     parse_outputs,
 )
+from dyfn_ros.replay_results import run_name, write_results
 from dyfn_ros.replay_video import Alignment
 from dyfn_ros.scene_cut import SceneCutHook
 
@@ -194,7 +186,7 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     if evaluation.frames == 0:
         reasons = "; ".join(recording.notes.losses) or "it holds no frames"
         raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
-    return _write_results(options, recording, model, evaluation)
+    return write_results(options, recording, model, evaluation)
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -254,91 +246,6 @@ def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
         recording.notes.warnings[reason] += 1
 
     return ReplayOutputs(options.out, options.recording, chosen, warn)
-
-
-def _write_results(
-    options: Options, recording: Recording, model: GeometryModel, evaluation: SequenceEvaluation
-) -> dict[str, Any]:
-    results = evaluation.results()
-    metrics = {
-        "frames": results.pop("frames"),
-        "model": options.model,
-        "stabilizer": options.stabilizer and model.stabilizer is not None,
-        "quantity": model.quantity,
-        **results,
-        "recording": {
-            "path": str(options.recording),
-            "topics": vars(recording.topics),
-            "losses": dict(recording.notes.losses),
-            "warnings": dict(recording.notes.warnings),
-        },
-        "options": {
-            "stride": options.stride,
-            "max_frames": options.max_frames,
-            "num_tokens": options.num_tokens,
-            "scene_cut_threshold": options.scene_cut_threshold,
-            "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
-        },
-    }
-    strip = evaluation.draw_strip()
-    with finished_file(options.out / "strip.png") as partial:
-        partial.write_bytes(encode_picture(strip))
-    with finished_file(options.out / "frames.csv") as partial:
-        _write_rows(partial, evaluation)
-    _write_report(options, metrics, evaluation, Picture(strip, "input, truth, depth, error"))
-    text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
-    with finished_file(options.out / "metrics.json") as partial:
-        partial.write_text(text, encoding="utf-8")
-    return metrics
-
-
-def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(evaluation.rows())
-
-
-def _write_report(
-    options: Options, metrics: dict[str, Any], evaluation: SequenceEvaluation, strip: Picture
-) -> None:
-    name = run_name(metrics)
-    facts: list[list[str | float | int | None]] = [
-        ["recording", str(options.recording)],
-        ["frames", metrics["frames"]],
-        ["model", options.model],
-        ["DyFN", "on" if metrics["stabilizer"] else "off"],
-        ["valid share of the pixels with truth", metrics["coverage"]],
-        ["latency p99, ms", metrics["latency_ms"]["p99"]],
-        ["output SHA-256", metrics["output_sha256"][:16]],
-        *([topic, value] for topic, value in metrics["recording"]["topics"].items()),
-    ]
-    notes = metrics["recording"]["losses"] | metrics["recording"]["warnings"]
-    sections = [
-        Section("Scores", [score_table({name: metrics}), Text(SCORE_NOTE, note=True)]),
-        Section("Frames", [strip]),
-    ]
-    if metrics["image"] is not None:
-        curves = Picture(curve_picture({name: evaluation}), "scale and error", photographic=False)
-        sections.append(Section("Over time", [curves]))
-    if notes:
-        rows = [[text, count] for text, count in notes.items()]
-        sections.append(Section("Losses and warnings", [Table(("", "times"), rows)]))
-    sections.append(Section("What was run", [Table(("", ""), facts)]))
-    write_report(options.out / "report.html", f"Replay of {options.recording.name}", sections)
-
-
-SCORE_NOTE = (
-    "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
-    "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
-    "shift for the whole sequence. Scale spread: standard deviation of the log of each frame's "
-    "own scale. The controls know nothing of the image: a vertical ramp and a constant."
-)
-
-
-def run_name(metrics: dict[str, Any]) -> str:
-    """How a run is called in tables."""
-    return f"{metrics['model']}{' with DyFN' if metrics['stabilizer'] else ', base model'}"
 
 
 def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> int:

@@ -26,7 +26,7 @@ from dyfn_ros.replay_video import Alignment
 
 SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
-WALL = 4.0  # metres from the origin along the world's z
+WALL = 4.02  # metres from the origin along the world's z; on no border of voxels
 
 
 def camera_pose(index: int) -> np.ndarray:
