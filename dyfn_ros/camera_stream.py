@@ -100,6 +100,14 @@ class Geometry:
     metric: bool = False
     disparity: np.ndarray | None = None
 
+    @property
+    def said(self) -> tuple[np.ndarray, np.ndarray]:
+        """What is aligned to truth, H x W, and where it is valid: depth; or disparity, also where
+        its inverse is too far to be depth."""
+        if self.disparity is not None:
+            return self.disparity, np.isfinite(self.disparity)
+        return self.depth, self.valid
+
     def scaled(self, scale: float) -> Geometry:
         """The same in metres: points and depth times the metres of one unit."""
         factor = np.float32(scale)

@@ -24,7 +24,7 @@ from dyfn_ros.environment import prepare_environment
 from dyfn_ros.node_process import NODE_COMMAND, LiveError, NodeProcess
 from dyfn_ros.recording_writer import COMPRESSED_IMAGE
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.replay import SCORE_NOTE
+from dyfn_ros.replay_results import SCORE_NOTE
 
 if TYPE_CHECKING:
     from dyfn_ros.live_player import LivePlayer

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+import apsw
 import cv2
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from dyfn_ros.finished_file import OutputError, cannot_write
+
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
 DepthEncoding = Literal["png", "16UC1", "32FC1"]
+ColourEncoding = Literal["jpeg", "png", "raw"]
 
 
 class RecordingError(Exception):
@@ -34,7 +40,7 @@ class RgbdFrame:
         None when the frame has no ground truth.
     camera_matrix: 3 x 3 intrinsics in pixels; None when unknown.
     pose: 4 x 4 camera-to-world in metres, optical frame; None when unknown.
-    stamp: seconds.
+    stamp: seconds. lens: of an image that is distorted.
     """
 
     image: np.ndarray
@@ -42,6 +48,22 @@ class RgbdFrame:
     camera_matrix: np.ndarray | None
     pose: np.ndarray | None
     stamp: float
+    lens: Lens | None = None
+
+    @property
+    def stamp_ns(self) -> int:
+        """Nanoseconds; of seconds since 1970, whose floats are no finer, to the microsecond."""
+        if abs(self.stamp) < 1e6:
+            return round(self.stamp * 1e9)
+        return round(self.stamp * 1e6) * 1000
+
+
+@dataclass(frozen=True)
+class Lens:
+    """model: plumb_bob, rational_polynomial or equidistant. coefficients: as CameraInfo.d."""
+
+    model: str
+    coefficients: tuple[float, ...]
 
 
 class RecordingWriter:
@@ -94,8 +116,12 @@ class RecordingWriter:
             self.discard()
 
     def close(self) -> None:
-        """Finish the recording and move it to its path."""
-        self._writer.close()
+        """Finish the recording and move it to its path. Raises OutputError, and leaves nothing."""
+        try:
+            self._writer.close()
+        except WRITE_ERRORS as error:
+            self.discard()
+            raise _full(self.path, error) from error
         folder = self._partial / self.path.stem
         source = next(folder.glob(f"*{self.path.suffix}")) if self._bare else folder
         if self.path.is_dir():
@@ -105,8 +131,9 @@ class RecordingWriter:
 
     def discard(self) -> None:
         """Drop everything written so far; an older recording at the path stays."""
-        self._writer.close()
-        shutil.rmtree(self._partial)
+        with suppress(Exception):  # whatever a full disk does here must not hide the first error
+            self._writer.close()
+        shutil.rmtree(self._partial, ignore_errors=True)
 
     def write(self, topic: str, kind: str, message: object, stamp_ns: int) -> None:
         """Write a message of type `kind` (such as "sensor_msgs/msg/Image") as logged at stamp_ns.
@@ -123,7 +150,10 @@ class RecordingWriter:
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise RecordingError(f"topic {topic} holds {connection.msgtype}, not {kind}")
-        self._writer.write(connection, stamp_ns, data)
+        try:
+            self._writer.write(connection, stamp_ns, data)
+        except WRITE_ERRORS as error:
+            raise _full(self.path, error) from error
 
     def write_image(self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str) -> None:
         """image: H x W x 3 uint8 RGB, written raw as rgb8."""
@@ -135,6 +165,12 @@ class RecordingWriter:
         """image: H x W x 3 uint8 RGB, written as a JPEG CompressedImage."""
         data = _encode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         message = compressed_message(data, "rgb8; jpeg compressed bgr8", stamp_ns, frame_id)
+        self.write(topic, COMPRESSED_IMAGE, message, stamp_ns)
+
+    def write_png(self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str) -> None:
+        """image: H x W x 3 uint8 RGB, written as a lossless PNG CompressedImage."""
+        data = _encode(".png", image[..., ::-1], [])
+        message = compressed_message(data, "rgb8; png compressed bgr8", stamp_ns, frame_id)
         self.write(topic, COMPRESSED_IMAGE, message, stamp_ns)
 
     def write_depth(
@@ -171,9 +207,10 @@ class RecordingWriter:
         size: tuple[int, int],
         stamp_ns: int,
         frame_id: str,
+        lens: Lens | None = None,
     ) -> None:
-        """camera_matrix: 3 x 3 in pixels of an undistorted image of size (H, W)."""
-        message = camera_info(camera_matrix, size, stamp_ns, frame_id)
+        """camera_matrix: 3 x 3 in pixels of an image of size (H, W); lens: None for a pinhole."""
+        message = camera_info(camera_matrix, size, stamp_ns, frame_id, lens)
         self.write(topic, CAMERA_INFO, message, stamp_ns)
 
     def write_pose(self, topic: str, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
@@ -214,6 +251,15 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 POSE = "geometry_msgs/msg/PoseStamped"
 TF = "tf2_msgs/msg/TFMessage"
+FLOAT = "std_msgs/msg/Float64"
+
+
+# What rosbags' storages raise when the disk is full or gone.
+WRITE_ERRORS = (OSError, sqlite3.Error, apsw.Error)
+
+
+def _full(path: Path, error: Exception) -> OutputError:
+    return cannot_write(path, error if isinstance(error, OSError) else OSError(str(error)))
 
 
 def write_rgbd_recording(
@@ -226,26 +272,32 @@ def write_rgbd_recording(
     frame_id: str = "camera_optical",
     world_frame: str = "world",
     jpeg_quality: int | None = 90,
+    colour: ColourEncoding = "jpeg",
     depth_encoding: DepthEncoding = "png",
 ) -> int:
     """Turn RGB-D frames into a recording and say how many there were.
 
-    Topics under `namespace`: image/compressed (image when jpeg_quality is None: raw rgb8),
-    camera_info, depth/image/compressed (depth/image for a raw depth_encoding), pose; and /tf.
+    Topics under `namespace`: image/compressed (image for raw rgb8: colour "raw" or jpeg_quality
+    None), camera_info, depth/image/compressed (depth/image for a raw depth_encoding), pose; and
+    /tf.
     Raises RecordingError when there are no frames or the path exists.
     """
     count = 0
     with RecordingWriter(path, storage, overwrite=overwrite) as writer:
         for count, frame in enumerate(frames, start=1):  # noqa: B007
-            stamp_ns = round(frame.stamp * 1e9)
-            if jpeg_quality is None:
+            stamp_ns = frame.stamp_ns
+            topic = f"{namespace}/image/compressed"
+            if colour == "raw" or jpeg_quality is None:
                 writer.write_image(f"{namespace}/image", frame.image, stamp_ns, frame_id)
+            elif colour == "png":
+                writer.write_png(topic, frame.image, stamp_ns, frame_id)
             else:
-                topic = f"{namespace}/image/compressed"
                 writer.write_jpeg(topic, frame.image, stamp_ns, frame_id, jpeg_quality)
             if frame.camera_matrix is not None:
                 topic, size = f"{namespace}/camera_info", frame.image.shape[:2]
-                writer.write_camera_info(topic, frame.camera_matrix, size, stamp_ns, frame_id)
+                writer.write_camera_info(
+                    topic, frame.camera_matrix, size, stamp_ns, frame_id, frame.lens
+                )
             if frame.depth_m is not None:
                 suffix = "/compressed" if depth_encoding == "png" else ""
                 topic = f"{namespace}/depth/image{suffix}"
@@ -273,17 +325,22 @@ def header(stamp_ns: int, frame_id: str) -> Any:
 
 
 def camera_info(
-    camera_matrix: np.ndarray, size: tuple[int, int], stamp_ns: int, frame_id: str
+    camera_matrix: np.ndarray,
+    size: tuple[int, int],
+    stamp_ns: int,
+    frame_id: str,
+    lens: Lens | None = None,
 ) -> Any:
-    """A CameraInfo of an undistorted camera: K and P from the 3 x 3 matrix, D zero."""
+    """A CameraInfo: K and P from the 3 x 3 matrix; D zero unless there is a lens."""
     matrix = np.asarray(camera_matrix, np.float64)
+    lens = lens or Lens("plumb_bob", (0.0,) * 5)
     return _new(
         CAMERA_INFO,
         header=header(stamp_ns, frame_id),
         height=size[0],
         width=size[1],
-        distortion_model="plumb_bob",
-        d=np.zeros(5),
+        distortion_model=lens.model,
+        d=np.array(lens.coefficients, np.float64),
         k=matrix.reshape(9),
         r=np.eye(3).reshape(9),
         p=np.hstack([matrix, np.zeros((3, 1))]).reshape(12),

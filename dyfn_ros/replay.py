@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import logging
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.report import Picture, Section, Table, Text, text_table, write_report
-from dyfn_core.evaluation.sequence import (
-    COLUMNS,
-    SequenceEvaluation,
-    curve_picture,
-    score_table,
-)
+from dyfn_core.evaluation.report import text_table
+from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.replay_recording import ReplayRecording
+from dyfn_ros.replay_outputs import (
+    DEFAULT,
+    FILES,
+    VOXEL,
+    OutputOptions,
+    ReplayOutputs,
+    parse_outputs,
+)
+from dyfn_ros.replay_results import run_name, write_results
+from dyfn_ros.replay_video import Alignment
 from dyfn_ros.scene_cut import SceneCutHook
 
 if TYPE_CHECKING:
@@ -58,19 +57,43 @@ class Options:
     depth_max: float = math.inf
     tolerance: float = 0.02
     scene_cut_threshold: float = 0.0
-    output_recording: bool = True
+    write: tuple[str, ...] = DEFAULT
+    pose_topic: str | None = None
+    voxel: float = VOXEL
+    progress: bool = True
 
 
-def parse(arguments: Sequence[str] | None = None) -> Options:
-    """Command line -> Options; ends the process with code 2 on a wrong one."""
+@dataclass(frozen=True)
+class Command:
+    """options: of every recording (its own is the first). recordings: as they were given.
+
+    jobs, ray: see fleet.FleetOptions.
+    """
+
+    options: Options
+    recordings: tuple[Path, ...]
+    jobs: int
+    ray: str | None
+
+
+def parse(arguments: Sequence[str] | None = None) -> Command:
+    """Command line -> Command; ends the process with code 2 on a wrong one."""
     parser = argparse.ArgumentParser(
         prog="dyfn-replay",
-        description="Run a recording through the model, as the node would, and score it.",
+        description="Run recordings through the model, as the node would, and score them.",
         epilog="Exit code: 0 everything was read, 3 part of the recording was damaged and the "
-        "rest was used, 2 nothing usable (the reason is on stderr).",
+        "rest was used, 2 nothing usable (the reason is on stderr). Of several recordings: 0 all "
+        "are whole, 3 some are partial or failed, 2 none gave results.",
     )
     add = parser.add_argument
-    add("recording", type=Path, help="rosbag2 folder, .mcap or .db3 file, or RGB-D folder")
+    add(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="recording",
+        help="rosbag2 folder, .mcap or .db3 file, RGB-D folder; several, a folder of them, or a "
+        ".txt file that lists them",
+    )
     add("--out", type=Path, required=True, help="folder for the results")
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
     add("--image-topic", help="colour image, raw or compressed")
@@ -90,8 +113,34 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
         default=0.0,
         help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
     )
-    add("--no-output-recording", dest="output_recording", action="store_false")
-    return Options(**vars(parser.parse_args(arguments)))
+    _add_output_options(parser)
+    add("--jobs", type=_positive, default=1, help="processes for several recordings")
+    add("--ray", metavar="ADDRESS", help='Ray cluster for several recordings; "local" makes one')
+    given = vars(parser.parse_args(arguments))
+    recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
+    return Command(Options(recordings[0], **given), tuple(recordings), jobs, ray)
+
+
+def _add_output_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--write",
+        type=_outputs,
+        default=DEFAULT,
+        metavar="LIST",
+        help=f"files beside scores and report: some of {','.join(FILES)}, or none "
+        f"(default: {','.join(DEFAULT)})",
+    )
+    add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
+    add("--pose-topic", help='poses, odometry or TF for cloud.ply; "none" for no cloud')
+    add("--voxel", type=_distance, default=VOXEL, help="voxels of cloud.ply, metres")
+
+
+def _outputs(text: str) -> tuple[str, ...]:
+    try:
+        return parse_outputs(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _positive(text: str) -> int:
@@ -137,7 +186,7 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     if evaluation.frames == 0:
         reasons = "; ".join(recording.notes.losses) or "it holds no frames"
         raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
-    return _write_results(options, recording, model, evaluation)
+    return write_results(options, recording, model, evaluation)
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -153,11 +202,10 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
     camera = CameraStream(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
-    with ExitStack() as stack:
-        writer = None
-        if options.output_recording:
-            writer = stack.enter_context(ReplayRecording(options.out / "output.mcap"))
-        for frame in tqdm(frames, total=expected, unit="frame", file=sys.stderr):
+    with _outputs_of(options, recording) as outputs:
+        for frame in tqdm(
+            frames, total=expected, unit="frame", file=sys.stderr, disable=not options.progress
+        ):
             start = time.perf_counter()
             seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
             stamp = seconds + nanoseconds * 1e-9
@@ -175,120 +223,53 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
             latency = time.perf_counter() - start
             try:
                 # Disparity is aligned as such, also where its inverse is too far to be depth.
-                said, valid = geometry.depth, geometry.valid
-                if geometry.disparity is not None:
-                    said, valid = geometry.disparity, np.isfinite(geometry.disparity)
-                evaluation.push(
+                score = evaluation.push(
                     frame.image,
-                    said,
-                    valid,
+                    *geometry.said,
                     frame.depth,
                     stamp=stamp,
                     latency=latency,
                 )
             except ValueError as error:
                 raise RecordingError(f"{recording.topics.depth}: {error}") from error
-            if writer is not None:
-                writer.write(frame, geometry)
+            outputs.write(frame, geometry, score)
+        video, quantity = evaluation.video(), model.quantity
+        alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
+        outputs.finish(alignment, quantity)
     return evaluation
 
 
-def _write_results(
-    options: Options, recording: Recording, model: GeometryModel, evaluation: SequenceEvaluation
-) -> dict[str, Any]:
-    results = evaluation.results()
-    metrics = {
-        "frames": results.pop("frames"),
-        "model": options.model,
-        "stabilizer": options.stabilizer and model.stabilizer is not None,
-        "quantity": model.quantity,
-        **results,
-        "recording": {
-            "path": str(options.recording),
-            "topics": vars(recording.topics),
-            "losses": dict(recording.notes.losses),
-            "warnings": dict(recording.notes.warnings),
-        },
-        "options": {
-            "stride": options.stride,
-            "max_frames": options.max_frames,
-            "num_tokens": options.num_tokens,
-            "scene_cut_threshold": options.scene_cut_threshold,
-            "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
-        },
-    }
-    strip = evaluation.draw_strip()
-    (options.out / "strip.png").write_bytes(encode_picture(strip))
-    _write_rows(options.out / "frames.csv", evaluation)
-    _write_report(options, metrics, evaluation, Picture(strip, "input, truth, depth, error"))
-    text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
-    partial = options.out / "metrics.json.partial"
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(options.out / "metrics.json")
-    return metrics
+def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
+    chosen = OutputOptions(options.write, options.pose_topic, options.voxel, options.depth_max)
 
+    def warn(reason: str) -> None:
+        recording.notes.warnings[reason] += 1
 
-def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(evaluation.rows())
-
-
-def _write_report(
-    options: Options, metrics: dict[str, Any], evaluation: SequenceEvaluation, strip: Picture
-) -> None:
-    name = run_name(metrics)
-    facts: list[list[str | float | int | None]] = [
-        ["recording", str(options.recording)],
-        ["frames", metrics["frames"]],
-        ["model", options.model],
-        ["DyFN", "on" if metrics["stabilizer"] else "off"],
-        ["valid share of the pixels with truth", metrics["coverage"]],
-        ["latency p99, ms", metrics["latency_ms"]["p99"]],
-        ["output SHA-256", metrics["output_sha256"][:16]],
-        *([topic, value] for topic, value in metrics["recording"]["topics"].items()),
-    ]
-    notes = metrics["recording"]["losses"] | metrics["recording"]["warnings"]
-    sections = [
-        Section("Scores", [score_table({name: metrics}), Text(SCORE_NOTE, note=True)]),
-        Section("Frames", [strip]),
-    ]
-    if metrics["image"] is not None:
-        curves = Picture(curve_picture({name: evaluation}), "scale and error", photographic=False)
-        sections.append(Section("Over time", [curves]))
-    if notes:
-        rows = [[text, count] for text, count in notes.items()]
-        sections.append(Section("Losses and warnings", [Table(("", "times"), rows)]))
-    sections.append(Section("What was run", [Table(("", ""), facts)]))
-    write_report(options.out / "report.html", f"Replay of {options.recording.name}", sections)
-
-
-SCORE_NOTE = (
-    "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
-    "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
-    "shift for the whole sequence. Scale spread: standard deviation of the log of each frame's "
-    "own scale. The controls know nothing of the image: a vertical ramp and a constant."
-)
-
-
-def run_name(metrics: dict[str, Any]) -> str:
-    """How a run is called in tables."""
-    return f"{metrics['model']}{' with DyFN' if metrics['stabilizer'] else ', base model'}"
+    return ReplayOutputs(options.out, options.recording, chosen, warn)
 
 
 def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> int:
     """-> exit code."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    options = parse(arguments)
+    command = parse(arguments)
     try:
-        metrics = replay(options, loader)
+        return _replay_command(command, loader)
     except (RecordingError, ValueError, OSError) as error:
         print(f"dyfn-replay: {error}", file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
-        print("dyfn-replay: interrupted, nothing was written", file=sys.stderr)
+        print("dyfn-replay: interrupted, unfinished results were not written", file=sys.stderr)
         return 130
+
+
+def _replay_command(command: Command, loader: ModelLoader) -> int:
+    from dyfn_ros import fleet  # which is above this module
+
+    options = command.options
+    if fleet.is_many(command.recordings):
+        chosen = fleet.FleetOptions(command.jobs, command.ray)
+        return fleet.replay_all(fleet.expand(command.recordings), options, chosen, loader)
+    metrics = replay(options, loader)
     notes = metrics["recording"]
     for kind in ("losses", "warnings"):
         for text, count in notes[kind].items():
@@ -298,7 +279,9 @@ def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> 
             )
     print(f"{metrics['frames']} frames of {options.recording}")
     print(text_table(score_table({run_name(metrics): metrics})))
-    print(f"results in {options.out} (report.html, metrics.json, frames.csv, output.mcap)")
+    written = [name for name in FILES.values() if (options.out / name).exists()]
+    listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
+    print(f"results in {options.out}: {listed}")
     return PARTIAL if notes["losses"] else ALL
 
 

@@ -1,18 +1,19 @@
-"""What a replay leaves as a recording: input, depth, camera info and cloud, for Foxglove."""
+"""What a replay leaves as a recording for Foxglove: input, depth, camera info, cloud, scale."""
 
 from __future__ import annotations
 
-import math
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from dyfn_core.evaluation.protocols import FrameScore, sample_grid
 from dyfn_ros.camera_stream import Geometry
 from dyfn_ros.messages import CLOUD_OFFSETS, CLOUD_STEP, depth_fields, pack_cloud
 from dyfn_ros.recording_writer import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    FLOAT,
     IMAGE,
     POINT_CLOUD,
     TYPES,
@@ -48,7 +49,7 @@ class ReplayRecording:
     ) -> None:
         self._writer.__exit__(kind, error, trace)
 
-    def write(self, frame: RecordedFrame, geometry: Geometry) -> None:
+    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
         """Everything of one frame."""
         self._write_input(frame)
         head = header(frame.stamp_ns, frame.frame_id)
@@ -59,9 +60,14 @@ class ReplayRecording:
         self._writer.write(topic, CAMERA_INFO, info, frame.stamp_ns)
         cloud = cloud_message(frame, geometry)
         self._writer.write("/stream_depth/points", POINT_CLOUD, cloud, frame.stamp_ns)
+        for name, value in score_values(geometry, score).items():
+            number = TYPES.types[FLOAT](data=value)
+            self._writer.write(f"/stream_depth/{name}", FLOAT, number, frame.stamp_ns)
 
     def _write_input(self, frame: RecordedFrame) -> None:
-        source = frame.source
+        source, info = frame.source, frame.info
+        if info is not None:
+            self._writer.write_cdr(info.topic, info.kind, info.data, frame.stamp_ns)
         if source.kind == COMPRESSED_IMAGE:
             self._writer.write_cdr(source.topic, source.kind, source.data, frame.stamp_ns)
             return
@@ -71,9 +77,7 @@ class ReplayRecording:
 
 def cloud_message(frame: RecordedFrame, geometry: Geometry) -> Any:
     """A PointCloud2 of every s-th point, s the smallest that gives at most MAX_POINTS."""
-    step = max(1, math.ceil(math.sqrt(geometry.depth.size / MAX_POINTS)))
-    grid = (slice(step // 2, None, step),) * 2
-    cloud = pack_cloud(geometry.points[grid], geometry.valid[grid], frame.image[grid])
+    cloud = pack_cloud(*subsampled(frame, geometry))
     field = TYPES.types["sensor_msgs/msg/PointField"]
     return TYPES.types[POINT_CLOUD](
         header=header(frame.stamp_ns, frame.frame_id),
@@ -89,3 +93,25 @@ def cloud_message(frame: RecordedFrame, geometry: Geometry) -> Any:
         data=np.ascontiguousarray(cloud).reshape(-1).view(np.uint8),
         is_dense=False,
     )
+
+
+def subsampled(
+    frame: RecordedFrame, geometry: Geometry
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, validity and colours of every s-th row and column, at most MAX_POINTS."""
+    grid = sample_grid(geometry.depth.shape, MAX_POINTS)
+    return geometry.points[grid], geometry.valid[grid], frame.image[grid]
+
+
+def score_values(geometry: Geometry, score: FrameScore) -> dict[str, float]:
+    """What is plotted over time: the frame's median depth, and with truth its own alignment.
+
+    median_depth: in the unit of the depth. scale, shift: what aligns this frame alone to the
+    truth (image protocol; shift in metres). abs_rel: after that.
+    """
+    values: dict[str, float] = {}
+    if geometry.valid.any():
+        values["median_depth"] = float(np.median(geometry.depth[geometry.valid]))
+    if score.metrics is not None and score.scale is not None and score.shift is not None:
+        values |= {"scale": score.scale, "shift": score.shift, "abs_rel": score.metrics["abs_rel"]}
+    return values

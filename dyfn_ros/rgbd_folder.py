@@ -48,6 +48,14 @@ def read_rgbd_folder(path: str | Path, rate: float = 10.0) -> Iterator[RgbdFrame
         )
 
 
+def read_poses(folder: Path) -> np.ndarray | None:
+    """N x 4 x 4 camera to world, one per colour frame; None without `poses.txt`.
+
+    Raises RecordingError when it has another number of rows than there are colour images.
+    """
+    return _matrix(folder / "poses.txt", (len(numbered(folder / "rgb", IMAGE_SUFFIXES)), 4, 4))
+
+
 def _matrix(file: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     if not file.exists():
         return None

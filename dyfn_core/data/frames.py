@@ -26,13 +26,15 @@ class RgbdFrame:
     image: H x W x 3 uint8 RGB. depth: H x W float32 metres along the optical axis, inf where
     nothing is hit (sky), NaN where it is unknown. intrinsics: normalised fx, fy, cx, cy (fx and cx
     in units of the width, fy and cy of the height, the image's corner at 0), float32. pose: 4 x 4
-    float64 camera to world in metres, optical axes (x right, y down, z forward), or None.
+    float64 camera to world in metres, optical axes (x right, y down, z forward), or None. stamp:
+    seconds, where the data set has stamps.
     """
 
     image: np.ndarray
     depth: np.ndarray
     intrinsics: np.ndarray
     pose: np.ndarray | None = None
+    stamp: float | None = None
 
 
 class FrameSequence(Protocol):

@@ -64,6 +64,7 @@ def test_it_writes_everything(recording: Path, tmp_path: Path) -> None:
         "output.mcap",
         "report.html",
         "strip.png",
+        "video.mp4",
     ]
     found = metrics(tmp_path / "out")
     assert (found["frames"], found["model"], found["stabilizer"]) == (5, "tiny", True)
@@ -110,10 +111,20 @@ def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: 
     read = output(tmp_path / "out")
     assert {topic: len(found) for topic, found in read.items()} == {
         "/camera/image/compressed": 5,
+        "/camera/camera_info": 5,
         "/stream_depth/depth/image": 5,
         "/stream_depth/depth/camera_info": 5,
         "/stream_depth/points": 5,
+        "/stream_depth/median_depth": 5,
+        "/stream_depth/scale": 5,
+        "/stream_depth/shift": 5,
+        "/stream_depth/abs_rel": 5,
     }
+    with (tmp_path / "out" / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name, column in (("scale", "scale"), ("shift", "shift"), ("abs_rel", "image_abs_rel")):
+        said = [message.data for message in read[f"/stream_depth/{name}"]]
+        assert said == pytest.approx([float(row[column]) for row in rows])
     depth = read["/stream_depth/depth/image"][2]
     assert (depth.encoding, depth.header.frame_id) == ("32FC1", "camera_optical")
     assert not (depth.data.view(np.float32) == 0).any()
@@ -127,8 +138,12 @@ def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: 
     with (tmp_path / "out" / "output.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None and summary.statistics is not None
-    assert summary.statistics.message_count == 20
+    assert summary.statistics.message_count == 45
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+    assert "float64 data" in next(
+        s.data.decode() for s in summary.schemas.values() if s.name == "std_msgs/msg/Float64"
+    )
 
 
 def test_the_same_recording_gives_the_same_hash_whatever_the_storage(tmp_path: Path) -> None:
@@ -209,6 +224,7 @@ def test_a_damaged_recording_is_used_as_far_as_it_goes(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--pose-topic", "/nope"], "no topic /nope of poses"),
         (["--image-topic", "/nope"], "no topic /nope"),
         (["--depth-topic", "/camera/camera_info"], "is sensor_msgs/msg/CameraInfo"),
         (["--model", "huge"], "model 'huge' is unknown"),
@@ -231,7 +247,14 @@ def test_no_recording_is_exit_code_two(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(
-    "wrong", [["--max-frames", "0"], ["--stride", "-1"], ["--depth-max", "0"], ["--out"]]
+    "wrong",
+    [
+        ["--max-frames", "0"],
+        ["--stride", "-1"],
+        ["--depth-max", "0"],
+        ["--out"],
+        ["--write", "gif"],
+    ],
 )
 def test_wrong_options_are_refused(wrong: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:

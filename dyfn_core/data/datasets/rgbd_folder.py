@@ -6,7 +6,7 @@ import bisect
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -68,7 +68,7 @@ class Views:
     """The frames of one folder by number.
 
     camera: pixels of the colour image. poses: camera to world by number. unit: stored depth
-    values per metre; 0 and those in `invalid` are none.
+    values per metre; 0 and those in `invalid` are none. stamps: seconds by number.
     """
 
     files: dict[int, tuple[Path, Path]]
@@ -76,6 +76,7 @@ class Views:
     poses: dict[int, np.ndarray]
     unit: float
     invalid: tuple[int, ...] = ()
+    stamps: dict[int, float] = field(default_factory=dict)
 
 
 def open_rgbd_folder(
@@ -132,7 +133,8 @@ def _read(views: Views, number: int) -> RgbdFrame:
     depth[np.isin(stored, (0, *views.invalid))] = np.nan
     intrinsics = camera_intrinsics(*views.camera, image.shape[:2])
     image, depth = registered(image, depth, depth_path)
-    return rgbd_frame(image, depth, intrinsics, views.poses.get(number), depth_path)
+    frame = rgbd_frame(image, depth, intrinsics, views.poses.get(number), depth_path)
+    return replace(frame, stamp=views.stamps.get(number))
 
 
 def _usual_step(numbers: list[int]) -> int:
@@ -221,7 +223,8 @@ def _tum(folder: Path, options: Options, report: DataReport) -> tuple[Views, lis
         runs[-1].append(number)
         previous = stamp
     camera = options.intrinsics or _tum_camera(folder)
-    return Views(files, camera, placed, options.depth_scale or 5000.0), runs
+    stamps = {number: colours[number][0] for number in files}
+    return Views(files, camera, placed, options.depth_scale or 5000.0, stamps=stamps), runs
 
 
 def _tum_camera(folder: Path) -> Camera:

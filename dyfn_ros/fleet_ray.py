@@ -1,0 +1,61 @@
+"""Recordings replayed on a Ray cluster; needs the extra `ray`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from dyfn_ros.finished_file import OutputError
+from dyfn_ros.fleet import CRASHED, Job, Outcome, Runner, run_one
+from dyfn_ros.replay import ModelLoader
+
+LOCAL = "local"  # Ray's own word for a cluster of this machine, made for this run
+
+
+def ray_runner(address: str, jobs: int = 1) -> Runner:
+    """A runner for the cluster at `address` ("auto", "HOST:PORT", "ray://HOST:PORT" or "local").
+
+    Its machines must have this package installed and see the recordings, the output folder and
+    model files at the same paths. A recording whose worker dies is tried once more. Raises
+    OutputError without the library, ConnectionError without the cluster.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise OutputError(
+            f"--ray needs Ray ({error}): install this package with its `ray` extra"
+        ) from error
+
+    def run(waiting: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
+        if not waiting:
+            return
+        cpus = jobs * max(job.options.threads or 1 for job in waiting)
+        ours: dict[str, Any] = {
+            "num_cpus": cpus,
+            "include_dashboard": False,
+            "_node_ip_address": "127.0.0.1",
+        }
+        ray.init(address, log_to_driver=False, **(ours if address == LOCAL else {}))
+        try:
+            yield from _outcomes(ray, waiting, loader)
+        finally:
+            ray.shutdown()
+
+    return run
+
+
+def _outcomes(ray: Any, jobs: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
+    tasks = {}
+    for job in jobs:
+        needs = {"num_cpus": job.options.threads, "num_gpus": int("cuda" in job.options.device)}
+        remote = ray.remote(max_retries=1, **needs)(run_one)
+        tasks[remote.remote(job.options, loader)] = job
+    while tasks:
+        done, _ = ray.wait(list(tasks))
+        for task in done:
+            try:
+                outcome = ray.get(task)
+            except ray.exceptions.RayError as error:
+                first = str(error).strip().splitlines()[0]
+                outcome = Outcome(CRASHED, f"{type(error).__name__}: {first}")
+            yield tasks.pop(task), outcome

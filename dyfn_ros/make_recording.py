@@ -1,0 +1,183 @@
+"""`dyfn-record`: a recording out of an RGB-D folder or a video file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from dyfn_ros.camera_yaml import read_camera_yaml
+from dyfn_ros.recording_sources import folder_frames, video_frames
+from dyfn_ros.recording_writer import (
+    STORAGES,
+    ColourEncoding,
+    DepthEncoding,
+    Lens,
+    RecordingError,
+    RgbdFrame,
+    write_rgbd_recording,
+)
+
+ALL, UNUSABLE, PARTIAL = 0, 2, 3  # exit codes, as dyfn-replay's
+LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to make a recording of and how; see the command's --help."""
+
+    source: Path
+    out: Path
+    storage: str | None = None
+    overwrite: bool = False
+    colour: ColourEncoding = "jpeg"
+    quality: int = 90
+    depth: DepthEncoding = "16UC1"
+    intrinsics: tuple[float, float, float, float] | None = None
+    distortion: tuple[float, ...] | None = None
+    camera_info: Path | None = None
+    depth_scale: float | None = None
+    rate: float | None = None
+    stride: int = 1
+    max_frames: int | None = None
+    namespace: str = "/camera"
+    frame_id: str = "camera_optical"
+
+
+def parse(arguments: Sequence[str] | None = None) -> Options:
+    """Command line -> Options; ends the process with code 2 on a wrong one."""
+    parser = argparse.ArgumentParser(
+        prog="dyfn-record",
+        description="Make a recording out of an RGB-D folder (rgb/ depth/ K.txt, TUM, 7-Scenes, "
+        "ScanNet export) or a video file.",
+        epilog="Exit code: 0 everything is in it, 3 frames were left out (said on stderr), "
+        "2 nothing was made.",
+    )
+    add = parser.add_argument
+    add("source", type=Path, help="RGB-D folder or video file")
+    add("--out", type=Path, required=True, help="rosbag2 folder, or a .mcap or .db3 file")
+    add("--storage", choices=sorted(STORAGES), help="of a rosbag2 folder (default: mcap)")
+    add("--overwrite", action="store_true")
+    add("--colour", choices=get_args(ColourEncoding), default="jpeg", help="of colour images")
+    add("--quality", type=int, default=90, choices=range(1, 101), metavar="1..100", help="of JPEG")
+    add("--depth", choices=get_args(DepthEncoding), default="16UC1", help="of depth images")
+    add("--intrinsics", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="pixels")
+    add("--distortion", type=float, nargs="+", metavar="K", help="of a video: k1 k2 p1 p2 [k3 ...]")
+    add("--camera-info", type=Path, help="of a video: calibration YAML in the ROS format")
+    add("--depth-scale", type=_above_zero, help="stored depth values per metre")
+    add("--rate", type=_above_zero, help="frames a second of folders without stamps")
+    add("--stride", type=_at_least_one, default=1, help="take every N-th frame")
+    add("--max-frames", type=_at_least_one, help="stop after so many")
+    add("--namespace", default="/camera", help="of the topics")
+    add("--frame-id", default="camera_optical")
+    given = vars(parser.parse_args(arguments))
+    for name in ("intrinsics", "distortion"):
+        given[name] = None if given[name] is None else tuple(given[name])
+    return Options(**given)
+
+
+def _at_least_one(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
+    return value
+
+
+def _above_zero(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} must be above 0")
+    return value
+
+
+def make_recording(options: Options) -> tuple[int, Counter[str]]:
+    """Write the recording; -> frames in it, and what was left out, by reason.
+
+    Raises RecordingError (source, output path, options that do not fit) and OutputError (disk).
+    """
+    left_out: Counter[str] = Counter()
+    frames = islice(_frames(options, left_out), 0, None, options.stride)
+    count = write_rgbd_recording(
+        options.out,
+        islice(frames, options.max_frames),
+        storage=options.storage,
+        overwrite=options.overwrite,
+        namespace=options.namespace.rstrip("/"),
+        frame_id=options.frame_id,
+        jpeg_quality=options.quality,
+        colour=options.colour,
+        depth_encoding=options.depth,
+    )
+    return count, left_out
+
+
+def _frames(options: Options, left_out: Counter[str]) -> Iterator[RgbdFrame]:
+    def warn(reason: str) -> None:
+        left_out[reason] += 1
+
+    source = options.source
+    if not source.exists():
+        raise RecordingError(f"{source} does not exist; expected an RGB-D folder or a video file")
+    if source.is_dir():
+        if options.camera_info or options.distortion:
+            raise RecordingError(
+                f"{source}: --camera-info and --distortion are for videos; depth of a folder is "
+                "registered to undistorted images, whose --intrinsics can be given"
+            )
+        return folder_frames(source, warn, options.rate, options.intrinsics, options.depth_scale)
+    if options.rate or options.depth_scale:
+        raise RecordingError(f"{source}: --rate and --depth-scale are for folders, not for a video")
+    if options.camera_info is not None and (options.intrinsics or options.distortion):
+        raise RecordingError("give --camera-info, or --intrinsics and --distortion, not both")
+    if options.distortion and not options.intrinsics:
+        raise RecordingError("--distortion needs --intrinsics")
+    camera = None if options.camera_info is None else read_camera_yaml(options.camera_info)
+    return video_frames(source, warn, _matrix(options), _lens(options), camera)
+
+
+def _matrix(options: Options) -> np.ndarray | None:
+    if options.intrinsics is None:
+        return None
+    fx, fy, cx, cy = options.intrinsics
+    if not (fx > 0 and fy > 0):
+        raise RecordingError(f"--intrinsics: focal lengths must be above 0, got {fx} and {fy}")
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def _lens(options: Options) -> Lens | None:
+    values = options.distortion
+    if values is None:
+        return None
+    if len(values) not in LENSES:
+        raise RecordingError(
+            f"--distortion: expected {', '.join(map(str, LENSES))} numbers, got {len(values)}"
+        )
+    return Lens(LENSES[len(values)], values)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """-> exit code."""
+    options = parse(arguments)
+    try:
+        count, left_out = make_recording(options)
+    except (RecordingError, OSError) as error:
+        print(f"dyfn-record: {error}", file=sys.stderr)
+        return UNUSABLE
+    except KeyboardInterrupt:
+        print("dyfn-record: interrupted, nothing was written", file=sys.stderr)
+        return 130
+    for reason, times in left_out.items():
+        print(f"dyfn-record: {reason}{f' ({times} times)' if times > 1 else ''}", file=sys.stderr)
+    print(f"{count} frames in {options.out}")
+    return PARTIAL if left_out else ALL
+
+
+if __name__ == "__main__":
+    sys.exit(main())

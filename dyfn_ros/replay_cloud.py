@@ -1,0 +1,62 @@
+"""The PLY of a replay: every frame's points in the world, fused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dyfn_core.geometry.voxel_grid import VoxelGrid
+from dyfn_ros.finished_file import finished_file
+from dyfn_ros.frame_spool import FrameSpool, SmallFrame
+from dyfn_ros.replay_video import Alignment
+
+
+def write_cloud(
+    path: Path, spool: FrameSpool, alignment: Alignment, voxel: float, depth_max: float
+) -> str | None:
+    """Fuse the frames that have a pose into a coloured binary PLY, in metres of the poses' world.
+
+    voxel: edge of a voxel in metres; it doubles while the cloud would be too large.
+    depth_max: metres, farther points are left out. Flying pixels at depth edges are left out.
+    Returns what to warn about, if anything. Raises OutputError.
+    """
+    import trimesh  # slow to import
+
+    grid = VoxelGrid(voxel)
+    lost = 0
+    for frame in spool:
+        if frame.pose is None:
+            lost += 1
+            continue
+        grid.add(*world_points(frame, alignment, depth_max))
+    points, colours = grid.cloud()
+    if len(points) == 0:
+        path.unlink(missing_ok=True)  # of an earlier run
+        return f"no {path.name}: {spool.frames} frames, {lost} without a pose, gave no point"
+    cloud = trimesh.PointCloud(points, colours)
+    with finished_file(path) as partial:
+        partial.write_bytes(cloud.export(file_type="ply"))
+    notes = []
+    if lost:
+        notes.append(f"{lost} of {spool.frames} frames have no pose and are not in it")
+    if grid.size != voxel:
+        notes.append(f"voxels grew from {voxel:g} to {grid.size:g} m to bound its size")
+    if grid.outside:
+        notes.append(f"{grid.outside} points too far from the origin are left out")
+    return f"{path.name}: {'; '.join(notes)}" if notes else None
+
+
+def world_points(
+    frame: SmallFrame, alignment: Alignment, depth_max: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points N x 3 (metres, world) and colours N x 3 uint8 of the solid pixels within depth_max."""
+    assert frame.pose is not None
+    depth = alignment.depth(frame.said)
+    kept = frame.solid & np.isfinite(depth) & (depth > 0) & (depth <= depth_max)
+    v, u = np.nonzero(kept)
+    z = depth[kept]
+    pixels = np.stack([u, v, np.ones_like(u)], axis=1) * z[:, None]
+    camera = pixels @ np.linalg.inv(frame.matrix).T
+    world = camera @ frame.pose[:3, :3].T + frame.pose[:3, 3]
+    return world, frame.image[kept]

@@ -1,0 +1,97 @@
+"""A replay as a Rerun recording (.rrd); needs the extra `rerun`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from dyfn_core.evaluation.pictures import encode_picture
+from dyfn_core.evaluation.protocols import FrameScore
+from dyfn_ros.camera_stream import Geometry
+from dyfn_ros.finished_file import OutputError
+from dyfn_ros.recordings import RecordedFrame
+from dyfn_ros.replay_recording import score_values, subsampled
+
+APPLICATION = "dyfn_replay"
+
+
+def load_rerun() -> Any:
+    """The library. Raises OutputError that says what to install."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise OutputError(
+            f"writing .rrd needs rerun-sdk ({error}): install this package with its `rerun` extra"
+        ) from error
+    return rerun
+
+
+class RerunRecording:
+    """Entities: camera (pinhole), camera/image (JPEG), camera/depth, points; scores/NAME for each
+    of score_values.
+
+    On the timelines `stamp` and `frame`. Depth and points are as the model said them, up to
+    scale. The library writes in a thread of its own and only logs a full disk: the file is read
+    back at the end, and an incomplete one is an OutputError.
+    """
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._path = path
+        self._rerun = load_rerun()
+        self._partial = path.with_name(f".{path.name}.partial")
+        self._recording = self._rerun.RecordingStream(APPLICATION, recording_id=name)
+        self._frames = 0
+        try:
+            self._recording.save(self._partial)
+        except (OSError, RuntimeError) as error:
+            raise OutputError(f"{path}: cannot be written: {error}") from error
+
+    def __enter__(self) -> RerunRecording:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self._end()
+        except (OSError, RuntimeError, ValueError) as problem:
+            if kind is None:
+                raise OutputError(f"{self._path}: cannot be written: {problem}") from problem
+        else:
+            if kind is None:
+                self._partial.replace(self._path)
+        finally:
+            self._partial.unlink(missing_ok=True)
+
+    def _end(self) -> None:
+        from rerun.chunk import RrdReader
+
+        self._recording.flush()
+        self._recording.disconnect()
+        if self._frames and not RrdReader(self._partial).recordings():  # an intact index
+            raise ValueError("the file holds no recording after it was written")
+
+    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
+        """Everything of one frame."""
+        rr, log = self._rerun, self._recording.log
+        self._recording.set_time("frame", sequence=self._frames)
+        self._recording.set_time("stamp", timestamp=np.datetime64(frame.stamp_ns, "ns"))
+        self._frames += 1
+        jpeg = encode_picture(frame.image, ".jpg")
+        log("camera/image", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        height, width = geometry.depth.shape
+        matrix = geometry.camera_matrix
+        pinhole = rr.Pinhole(image_from_camera=matrix, width=width, height=height)
+        log("camera", pinhole)
+        depth = np.where(geometry.valid, geometry.depth, 0).astype(np.float32)
+        log("camera/depth", rr.DepthImage(depth, meter=1.0))
+        points, valid, colours = subsampled(frame, geometry)
+        log("points", rr.Points3D(points[valid], colors=colours[valid]))
+        for name, value in score_values(geometry, score).items():
+            log(f"scores/{name}", rr.Scalars(value))

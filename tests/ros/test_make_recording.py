@@ -1,0 +1,233 @@
+"""dyfn-record: made recordings replay to the frames, stamps, intrinsics and depth of the source."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from dyfn_ros.make_recording import ALL, PARTIAL, UNUSABLE, main
+from dyfn_ros.poses import open_poses
+from dyfn_ros.recordings import RecordedFrame, open_recording
+
+H, W = 24, 32
+STEREO_STAMPS = ("1305031102.175304", "1305031102.211214", "1305031103.275326")
+
+
+def picture(index: int) -> np.ndarray:
+    rng = np.random.default_rng(index)
+    return cv2.resize(rng.integers(0, 255, (4, 5, 3), np.uint8), (W, H))
+
+
+def millimetres(index: int) -> np.ndarray:
+    depth = np.random.default_rng(100 + index).integers(400, 9000, (H, W)).astype(np.uint16)
+    depth[0, :4] = 0
+    return depth
+
+
+def save(path: Path, rgb: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), rgb[..., ::-1] if rgb.ndim == 3 else rgb)
+
+
+def pose(index: int) -> np.ndarray:
+    angle, made = 0.3 * index, np.eye(4)
+    made[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    made[:3, 3] = [index, 2, -0.5]
+    return made
+
+
+def plain(folder: Path) -> tuple[list[int], np.ndarray]:
+    matrix = np.array([[30.5, 0, 15.25], [0, 31, 11.75], [0, 0, 1]])
+    for i in range(3):
+        save(folder / "rgb" / f"{i}.png", picture(i))
+        save(folder / "depth" / f"{i}.png", millimetres(i))
+    np.savetxt(folder / "K.txt", matrix)
+    np.savetxt(folder / "poses.txt", np.array([pose(i).ravel() for i in range(3)]))
+    return [0, 100_000_000, 200_000_000], matrix
+
+
+def tum(folder: Path) -> tuple[list[int], np.ndarray]:
+    rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for i, stamp in enumerate(STEREO_STAMPS):
+        save(folder / "rgb" / f"{stamp}.png", picture(i))
+        save(folder / "depth" / f"{stamp}.png", millimetres(i) * 5)
+        for kind in ("rgb", "depth"):
+            rows[kind].append(f"{stamp} {kind}/{stamp}.png")
+        half = 0.15 * i
+        rows["groundtruth"].append(f"{stamp} {i} 2 -0.5 0 0 {np.sin(half)} {np.cos(half)}")
+    for kind, lines in rows.items():
+        (folder / f"{kind}.txt").write_text("\n".join(["# a comment", *lines]))
+    stamps = [int(text.replace(".", "")) * 1000 for text in STEREO_STAMPS]
+    return stamps, np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+
+
+def seven_scenes(folder: Path) -> tuple[list[int], np.ndarray]:
+    for i, number in enumerate((0, 1, 3)):
+        base = folder / f"frame-{number:06d}"
+        save(base.with_name(f"{base.name}.color.png"), picture(i))
+        save(base.with_name(f"{base.name}.depth.png"), millimetres(i))
+        np.savetxt(base.with_name(f"{base.name}.pose.txt"), pose(i))
+    stamps = [0, 33_333_333, 100_000_000]
+    return stamps, np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
+
+
+def scannet(folder: Path) -> tuple[list[int], np.ndarray]:
+    for i in range(3):
+        save(folder / "color" / f"{i * 10}.png", picture(i))
+        save(folder / "depth" / f"{i * 10}.png", millimetres(i))
+        (folder / "pose").mkdir(exist_ok=True)
+        np.savetxt(folder / "pose" / f"{i * 10}.txt", pose(i))
+    matrix = np.array([[28.9, 0, 15.5], [0, 29, 11.5], [0, 0, 1]])
+    four = np.eye(4)
+    four[:3, :3] = matrix
+    (folder / "intrinsic").mkdir()
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", four)
+    return [0, 333_333_333, 666_666_667], matrix
+
+
+def made(source: Path, out: Path, *options: object) -> list[RecordedFrame]:
+    assert main([str(source), "--out", str(out), *map(str, options)]) == ALL
+    return list(open_recording(out).frames())
+
+
+@pytest.mark.parametrize(
+    ("layout", "name", "options"),
+    [
+        (plain, "walk", ("--colour", "png")),
+        (plain, "walk.mcap", ("--colour", "raw", "--depth", "png")),
+        (tum, "walk.db3", ("--colour", "raw")),
+        (seven_scenes, "walk", ("--colour", "png", "--storage", "sqlite3", "--depth", "32FC1")),
+        (scannet, "walk.mcap", ("--colour", "png")),
+    ],
+)
+def test_a_folder_comes_back_as_it_was(tmp_path: Path, layout, name, options) -> None:  # type: ignore[no-untyped-def]
+    source = tmp_path / "freiburg1_desk"
+    stamps, matrix = layout(source)
+    frames = made(source, tmp_path / name, *options)
+    assert [frame.stamp_ns for frame in frames] == stamps
+    where = open_poses(tmp_path / name, "camera_optical")
+    for index, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, picture(index))
+        stored = millimetres(index)
+        expected = np.where(stored > 0, stored / np.float32(1000), np.nan)
+        np.testing.assert_allclose(frame.depth, expected, rtol=1e-6)  # type: ignore[arg-type]
+        np.testing.assert_allclose(frame.camera_matrix, matrix, rtol=1e-6)  # type: ignore[arg-type]
+        found = where(index, frame.stamp_ns)
+        np.testing.assert_allclose(found, pose(index), atol=1e-9)  # type: ignore[arg-type]
+
+
+def film(path: Path, times: list[float]) -> Path:
+    """A video whose frames are at these seconds, grey of 20 x their index."""
+    base = Fraction(1, 90_000)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.time_base = stream.time_base = base
+        for index, time in enumerate(times):
+            image = np.full((48, 64, 3), 20 * index, np.uint8)
+            frame = av.VideoFrame.from_ndarray(image)
+            frame.pts, frame.time_base = round(time * 90_000), base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return path
+
+
+CALIBRATION = {
+    "image_width": 64,
+    "image_height": 48,
+    "camera_name": "cam",
+    "camera_matrix": {"rows": 3, "cols": 3, "data": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]},
+    "distortion_model": "plumb_bob",
+    "distortion_coefficients": {"rows": 1, "cols": 5, "data": [-0.1, 0.01, 0, 0.002, 0]},
+}
+
+
+def test_a_video_keeps_the_times_of_its_frames(tmp_path: Path) -> None:
+    times = [0, 0.04, 0.2, 0.25, 1.5]
+    frames = made(film(tmp_path / "v.mp4", times), tmp_path / "walk.mcap", "--colour", "raw")
+    assert [f.stamp_ns / 1e9 for f in frames] == pytest.approx(times, abs=2e-4)
+    assert [f.image.mean() for f in frames] == pytest.approx([0, 20, 40, 60, 80], abs=2)
+    assert all(f.camera_matrix is None and f.depth is None for f in frames)
+    some = made(tmp_path / "v.mp4", tmp_path / "some", "--stride", "2", "--max-frames", "2")
+    assert [f.stamp_ns / 1e9 for f in some] == pytest.approx([0, 0.2], abs=2e-4)
+
+
+@pytest.mark.parametrize("by_file", [True, False])
+def test_a_video_is_given_a_lens(tmp_path: Path, by_file: bool) -> None:
+    film(tmp_path / "v.mp4", [0, 0.1])
+    (tmp_path / "cam.yaml").write_text(yaml.safe_dump(CALIBRATION))
+    numbers = [
+        "--intrinsics",
+        "60",
+        "61",
+        "31.5",
+        "23.5",
+        "--distortion",
+        "-0.1",
+        "0.01",
+        "0",
+        "0.002",
+        "0",
+    ]
+    given = ["--camera-info", tmp_path / "cam.yaml"] if by_file else numbers
+    frames = made(tmp_path / "v.mp4", tmp_path / "walk", *given)
+    assert frames[0].info is not None
+    info = frames[0].info.message()
+    assert (info.distortion_model, info.d.tolist()) == ("plumb_bob", [-0.1, 0.01, 0, 0.002, 0])
+    np.testing.assert_array_equal(info.k.reshape(3, 3), [[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]])
+    assert frames[0].visible is not None  # the lens was taken out
+
+
+def wrong(tmp_path: Path, *arguments: object) -> int:
+    return main([*map(str, arguments), "--out", str(tmp_path / "out")])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"image_width": 32}, "frames have 64 x 48 pixels, but the calibration is for 32 x 48"),
+        ({"image_height": "48"}, "image_height: expected pixels"),
+        ({"camera_matrix": {"data": [1, 2]}}, "camera_matrix: expected `data` of 9 numbers"),
+        ({"distortion_coefficients": {"data": ["a"]}}, "distortion_coefficients: expected"),
+    ],
+)
+def test_a_wrong_calibration_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict, message: str
+) -> None:
+    film(tmp_path / "v.mp4", [0])
+    (tmp_path / "cam.yaml").write_text(yaml.safe_dump(CALIBRATION | change))
+    arguments = (tmp_path / "v.mp4", "--camera-info", tmp_path / "cam.yaml")
+    assert wrong(tmp_path, *arguments) == UNUSABLE
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_source_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert wrong(tmp_path, tmp_path / "nowhere") == UNUSABLE
+    assert "nowhere does not exist" in capsys.readouterr().err
+    (tmp_path / "text.mp4").write_text("no video")
+    assert wrong(tmp_path, tmp_path / "text.mp4") == UNUSABLE
+    assert "text.mp4: expected a video file" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert wrong(tmp_path, tmp_path / "empty") == UNUSABLE
+    assert "expected one of: rgb.txt" in capsys.readouterr().err
+    for name in ("one", "two"):
+        seven_scenes(tmp_path / "scene" / name)
+    assert wrong(tmp_path, tmp_path / "scene") == UNUSABLE
+    assert "holds several folders" in capsys.readouterr().err
+    assert wrong(tmp_path, tmp_path / "scene" / "one", "--distortion", "1") == UNUSABLE
+    assert "are for videos" in capsys.readouterr().err
+
+
+def test_what_is_left_out_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    seven_scenes(tmp_path / "seq")
+    (tmp_path / "seq" / "frame-000001.depth.png").unlink()
+    assert wrong(tmp_path, tmp_path / "seq") == PARTIAL
+    assert "image without depth" in capsys.readouterr().err
+    assert len(list(open_recording(tmp_path / "out").frames())) == 2
+    assert wrong(tmp_path, tmp_path / "seq") == UNUSABLE
+    assert "exists already" in capsys.readouterr().err

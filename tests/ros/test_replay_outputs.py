@@ -1,0 +1,291 @@
+"""Cloud, video and Rerun recording of a replay, by value; poses; disks that are full."""
+
+import json
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from tiny_model import load_tiny
+
+from dyfn_core.geometry.voxel_grid import VoxelGrid
+from dyfn_ros.camera_stream import Geometry
+from dyfn_ros.poses import ODOMETRY, PoseError, open_poses
+from dyfn_ros.recording_writer import TYPES, RecordingWriter, RgbdFrame, header
+from dyfn_ros.recording_writer import write_rgbd_recording as record
+from dyfn_ros.recordings import open_recording
+from dyfn_ros.replay import ALL, UNUSABLE, main
+from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
+from dyfn_ros.replay_video import Alignment
+
+SIZE = (36, 48)
+CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
+WALL = 4.02  # metres from the origin along the world's z; on no border of voxels
+
+
+def camera_pose(index: int) -> np.ndarray:
+    """Walks towards the wall and turns about the optical axis."""
+    made = np.eye(4)
+    made[:3, :3] = Rotation.from_euler("z", 5 * index, degrees=True).as_matrix()
+    made[:3, 3] = [0.1 * index, 0, 0.3 * index]
+    return made
+
+
+def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[RgbdFrame]:
+    """Frames of a wall whose colour is green; true depth is the distance to it."""
+    image = np.full((*SIZE, 3), (10, 200, 30), np.uint8)
+    found = []
+    for index in range(count):
+        depth = np.full(SIZE, WALL - 0.3 * index)
+        where = camera_pose(index) if poses else None
+        found.append(RgbdFrame(image, depth if truth else None, CAMERA, where, 50 + index / 10))
+    return found
+
+
+def perfect_up_to(scale: float, depth: np.ndarray) -> Geometry:
+    """What a model would say that is right up to this scale."""
+    said = (depth / scale).astype(np.float32)
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
+    points = np.stack([(u - 23.5) / 40 * said, (v - 17.5) / 40 * said, said], axis=-1)
+    return Geometry(points, said, np.isfinite(said), CAMERA)
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[..., list[str]]:
+    """Plays a recording through ReplayOutputs with a perfect model; gives the warnings."""
+
+    def write(frames: list[RgbdFrame], aligned: bool = True, **options: Any) -> list[str]:
+        from dyfn_core.evaluation.protocols import FrameScore
+
+        record(tmp_path / "walk", frames, jpeg_quality=None, overwrite=True)
+        (tmp_path / "out").mkdir(exist_ok=True)
+        warnings: list[str] = []
+        chosen = OutputOptions(**options)
+        with ReplayOutputs(tmp_path / "out", tmp_path / "walk", chosen, warnings.append) as outputs:
+            for frame in open_recording(tmp_path / "walk").frames():
+                depth = WALL - 0.3 * frame.index + np.zeros(SIZE)
+                outputs.write(frame, perfect_up_to(2.5, depth), FrameScore(1.0, 10))
+            outputs.finish(Alignment(2.5, 0.0) if aligned else None)
+        return warnings
+
+    return write
+
+
+def test_the_cloud_is_where_the_world_is(tmp_path: Path, written: Callable[..., list[str]]) -> None:
+    assert written(facing_a_wall(6), write=("ply",), voxel=0.05) == []
+    content = (tmp_path / "out" / "cloud.ply").read_bytes()
+    assert content.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    cloud = trimesh.load(tmp_path / "out" / "cloud.ply")
+    points, colours = np.asarray(cloud.vertices), np.asarray(cloud.colors)
+    np.testing.assert_allclose(points[:, 2], WALL, atol=1e-3)  # depth was stored in millimetres
+    assert (colours[:, :3] == (10, 200, 30)).all()
+    cells = np.floor(points[:, :2] / 0.05)
+    assert len(np.unique(cells, axis=0)) == len(points)  # one point a voxel
+    first = (np.array([[0, 0], [47, 35]]) - [23.5, 17.5]) / 40 * WALL
+    assert points[:, 0].min() <= first[0, 0] + 0.05 and points[:, 1].max() >= first[1, 1] - 0.05
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["cloud.ply"]
+
+
+def test_no_cloud_is_invented(tmp_path: Path, written: Callable[..., list[str]]) -> None:
+    written(facing_a_wall(2), write=("ply",))
+    assert (tmp_path / "out" / "cloud.ply").exists()
+    (warning,) = written(facing_a_wall(2, poses=False), write=("ply",))
+    assert "no cloud.ply" in warning and "no pose or odometry topic" in warning
+    assert not (tmp_path / "out" / "cloud.ply").exists()  # that of the run before is gone
+    (warning,) = written(facing_a_wall(2), aligned=False, write=("ply",))
+    assert "no ground truth gives its metres" in warning
+    (warning,) = written(facing_a_wall(2), write=("ply",), depth_max=1.0)
+    assert "gave no point" in warning
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_metrics_say_why_there_is_no_cloud(tmp_path: Path) -> None:
+    record(tmp_path / "walk", facing_a_wall(2, poses=False))
+    arguments = [str(tmp_path / "walk"), "--out", str(tmp_path / "out"), "--model", "tiny"]
+    assert main([*arguments, "--write", "ply"], load_tiny) == ALL
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert "no cloud.ply" in next(iter(found["recording"]["warnings"]))
+
+
+def test_a_cloud_of_any_length_stays_bounded() -> None:
+    rng = np.random.default_rng(0)
+    grid = VoxelGrid(0.01, max_voxels=2000)
+    points = rng.uniform(-1, 1, (60_000, 3))
+    points[0] = 1e9
+    for part in np.array_split(points, 7):
+        grid.add(part, np.full((len(part), 3), 50, np.uint8))
+    found, colours = grid.cloud()
+    assert len(found) <= 2000 and grid.size == 0.32 and grid.outside == 1
+    cells, place = np.unique(np.floor(points[1:] / 0.32), axis=0, return_inverse=True)
+    means = np.stack([np.bincount(place, p) / np.bincount(place) for p in points[1:].T], axis=1)
+    assert len(found) == len(cells)
+    order, other = np.lexsort(found.T.round(3)), np.lexsort(means.T.round(3))
+    np.testing.assert_allclose(found[order], means[other], atol=1e-5)
+    assert (colours == 50).all()
+
+
+def test_the_video_plays_at_the_pace_of_the_stamps(
+    tmp_path: Path, written: Callable[..., list[str]]
+) -> None:
+    frames = facing_a_wall(5)
+    frames[4] = RgbdFrame(frames[4].image, frames[4].depth_m, CAMERA, None, 75.0)
+    written(frames, write=("video",))
+    with av.open(str(tmp_path / "out" / "video.mp4")) as video:
+        assert video.streams.video[0].codec_context.name == "h264"
+        shown = list(video.decode(video=0))
+    assert [f.time for f in shown] == pytest.approx([0, 0.1, 0.2, 0.3, 1.3], abs=2e-3)
+    pictures = [f.to_ndarray(format="rgb24")[24:60] for f in shown]
+    middles = [p[5:-5, 48 + 5 : 96 - 5].mean((0, 1)) for p in pictures]
+    green = [p[5:-5, 5:43].mean((0, 1)) for p in pictures]
+    np.testing.assert_allclose(green, np.tile([10, 200, 30], (5, 1)), atol=8)
+    assert np.abs(np.diff(middles, axis=0)).max(1).min() > 5  # nearer is redder, frame by frame
+    assert middles[-1][0] > middles[0][0] and middles[-1][2] < middles[0][2]
+    assert all(p[5:-5, 96 + 5 : 144 - 5].mean() < 12 for p in pictures)  # no error: black
+
+
+def test_flicker_is_seen_in_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same scene said 30 % farther is painted in another colour: the range does not follow."""
+    from dyfn_ros import frame_spool, replay_video
+
+    spool = frame_spool.FrameSpool(tmp_path)
+    record(tmp_path / "walk", facing_a_wall(1, truth=False))
+    frame = next(open_recording(tmp_path / "walk").frames())
+    ramp = np.tile(np.linspace(1, 5, SIZE[1]), (SIZE[0], 1))
+    for scale in (1.0, 1.3, 1.0):
+        spool.push(frame, perfect_up_to(1 / scale, ramp), None)
+    colours = replay_video._Colours(spool, Alignment())
+    first, second, third = (colours.draw(small)[24:, 48:] for small in spool)
+    np.testing.assert_array_equal(first, third)
+    assert np.abs(first.astype(int) - second).mean() > 10
+
+
+def test_the_rerun_recording_can_be_read_back(
+    tmp_path: Path, written: Callable[..., list[str]]
+) -> None:
+    pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    from rerun.chunk import RrdReader
+
+    written(facing_a_wall(3), write=("rrd",))
+    reader = RrdReader(tmp_path / "out" / "output.rrd")
+    assert [entry.application_id for entry in reader.recordings()] == ["dyfn_replay"]
+    rows: dict[str, int] = {}
+    for chunk in reader.stream():
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    wanted = ("camera", "camera/image", "camera/depth", "points", "scores/median_depth")
+    assert {name: rows.get(f"/{name}") for name in wanted} == dict.fromkeys(wanted, 3)
+
+
+def test_rerun_that_is_missing_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "rerun", None)
+    record(tmp_path / "walk", facing_a_wall(1))
+    arguments = [str(tmp_path / "walk"), "--out", str(tmp_path / "out"), "--model", "tiny"]
+    assert main([*arguments, "--write", "rrd"], load_tiny) == UNUSABLE
+    assert "with its `rerun` extra" in capsys.readouterr().err
+
+
+@pytest.fixture
+def small_files() -> Iterator[Callable[[int], None]]:
+    """Takes the size that no file may exceed, as if the disk were full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", list(FILES))
+def test_a_full_disk_leaves_no_half_file(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    small_files: Callable[[int], None],
+    name: str,
+) -> None:
+    if name == "rrd":
+        pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    rng = np.random.default_rng(0)
+    noise = [
+        RgbdFrame(rng.integers(0, 255, (*SIZE, 3), np.uint8), f.depth_m, CAMERA, f.pose, f.stamp)
+        for f in facing_a_wall(12)
+    ]
+    record(tmp_path / "walk", noise)
+    arguments = [str(tmp_path / "walk"), "--out", str(tmp_path / "out"), "--model", "tiny"]
+    small_files(20_000)
+    assert main([*arguments, "--write", name], load_tiny) == UNUSABLE
+    assert "cannot be written" in capsys.readouterr().err
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def odometry(path: Path, tie: bool) -> None:
+    """A base that moves along x, with a camera 0.5 m ahead of it that looks forward."""
+    types = TYPES.types
+    with RecordingWriter(path, overwrite=True) as writer:
+        mount = np.eye(4)
+        mount[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+        mount[0, 3] = 0.5
+        if tie:
+            writer.write_transform(mount, 0, "base", "camera_optical", "/tf_static")
+        for index in range(3):
+            zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+            pose = types["geometry_msgs/msg/Pose"](
+                position=types["geometry_msgs/msg/Point"](x=float(index), y=0.0, z=0.0),
+                orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+            )
+            cov = np.zeros(36)
+            message = types[ODOMETRY](
+                header=header(index * 200_000_000, "odom"),
+                child_frame_id="base",
+                pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=cov),
+                twist=types["geometry_msgs/msg/TwistWithCovariance"](
+                    twist=types["geometry_msgs/msg/Twist"](linear=zero, angular=zero),
+                    covariance=cov,
+                ),
+            )
+            writer.write("/odom", ODOMETRY, message, index * 200_000_000)
+
+
+def test_odometry_is_carried_to_the_camera(tmp_path: Path) -> None:
+    odometry(tmp_path / "odo", tie=True)
+    where = open_poses(tmp_path / "odo", "camera_optical")
+    found = where(0, 300_000_000)
+    assert found is not None
+    np.testing.assert_allclose(found[:3, 3], [2.0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(found[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-9)
+    assert where(0, 410_000_000) is not None and where(0, 500_000_000) is None
+    odometry(tmp_path / "odo", tie=False)
+    with pytest.raises(PoseError, match="no static TF ties it to the camera"):
+        open_poses(tmp_path / "odo", "camera_optical")
+
+
+def test_poses_between_two_are_interpolated(tmp_path: Path) -> None:
+    record(tmp_path / "walk", facing_a_wall(3))
+    for topic in (None, "/tf", "/camera/pose"):
+        where = open_poses(tmp_path / "walk", "camera_optical", topic)
+        found = where(0, 50_050_000_000)
+        assert found is not None
+        np.testing.assert_allclose(found[:3, 3], [0.05, 0, 0.15], atol=1e-9)
+        turned = Rotation.from_matrix(found[:3, :3]).as_euler("xyz", degrees=True)
+        np.testing.assert_allclose(turned, [0, 0, 2.5], atol=1e-9)
+
+
+def test_several_pose_topics_are_listed(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "walk") as writer:
+        for topic in ("/a", "/b"):
+            writer.write_pose(topic, np.eye(4), 0, "world")
+    with pytest.raises(PoseError, match=r"choose one with --pose-topic: /a \(geo.*\), /b"):
+        open_poses(tmp_path / "walk", "camera")
+
+
+def test_an_rgbd_folder_has_its_poses(tmp_path: Path) -> None:
+    (tmp_path / "rgb").mkdir()
+    for index in range(3):
+        cv2.imwrite(str(tmp_path / "rgb" / f"{index}.png"), np.zeros((*SIZE, 3), np.uint8))
+    with pytest.raises(PoseError, match=r"holds no poses\.txt"):
+        open_poses(tmp_path, "camera_optical")
+    np.savetxt(tmp_path / "poses.txt", [camera_pose(i).ravel() for i in range(3)])
+    np.testing.assert_allclose(open_poses(tmp_path, "camera_optical")(2, 0), camera_pose(2))  # type: ignore[arg-type]
