@@ -62,6 +62,8 @@ setup(
         "huggingface_hub>=0.23",
         "rosbags>=0.11",
         "mcap>=1.1",
+        "zstandard>=0.19",
+        "lz4>=4",
     ],
     # ROS from wheels is an extra: it must not get in the way of an apt-installed ROS 2.
     extras_require={

@@ -285,7 +285,7 @@ def test_an_mcap_by_another_writer_without_ros_profile_is_read(tmp_path: Path) -
         ("empty.db3", b"", "is empty"),
         ("text.mcap", b"no recording at all", "is not a readable recording"),
         ("text.db3", b"no recording at all", "is not a readable recording"),
-        ("notes.txt", b"hello", "expected a rosbag2 folder, an .mcap or .db3 file"),
+        ("notes.txt", b"hello", "expected a rosbag2 folder, an .mcap, .db3 or .bag file"),
     ],
 )
 def test_what_is_no_recording_is_refused(
