@@ -159,7 +159,8 @@ class Bag1File(ChunkedFile):
         try:
             header = read_header(file, self.size - position)
             file.seek(4, 1)
-            for recorded in self._messages(unpack_chunk(header, file.read(MAX_BYTES), whole=False)):
+            data = file.read(min(MAX_BYTES, self.size - file.tell()))
+            for recorded in self._messages(unpack_chunk(header, data, whole=False)):
                 found.append(recorded)
         except DAMAGE:
             pass  # reported already

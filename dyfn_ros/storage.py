@@ -123,7 +123,7 @@ def _open_folder(path: Path) -> Storage:
             ]
             files = [f for f in listed if f.exists()] or files
         except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
-            problem = f": {error}"
+            problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
     if not files:
         raise RecordingError(
             f"{path}: expected a rosbag2 folder (metadata.yaml and .mcap or .db3 files) "
