@@ -11,10 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -28,9 +28,16 @@ from dyfn_core.evaluation.sequence import (
     score_table,
 )
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
-from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
+from dyfn_ros.recordings import (
+    RecordedFrame,
+    Recording,
+    RecordingError,
+    image_topics,
+    open_recording,
+)
 from dyfn_ros.replay_recording import ReplayRecording
 from dyfn_ros.scene_cut import SceneCutHook
+from dyfn_ros.threads import THREADS, computing_threads
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -47,14 +54,19 @@ class Options:
     out: Path
     model: str = "dyfn-mini"
     image_topic: str | None = None
+    image_topics: tuple[str, ...] = ()  # several: one replay each, see split
+    all_topics: bool = False
     camera_info_topic: str | None = None
     depth_topic: str | None = None
+    depth_info_topic: str | None = None
+    depth_transform: str | None = None
+    stamps: Literal["header", "log"] = "header"
     stabilizer: bool = True
     max_frames: int | None = None
     stride: int = 1
     num_tokens: int | None = None
     device: str = "cpu"
-    threads: int | None = None
+    threads: int = THREADS
     depth_max: float = math.inf
     tolerance: float = 0.02
     scene_cut_threshold: float = 0.0
@@ -70,20 +82,23 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
         "rest was used, 2 nothing usable (the reason is on stderr).",
     )
     add = parser.add_argument
-    add("recording", type=Path, help="rosbag2 folder, .mcap or .db3 file, or RGB-D folder")
+    add("recording", type=Path, help="rosbag2 folder, .mcap, .db3 or .bag file, or RGB-D folder")
     add("--out", type=Path, required=True, help="folder for the results")
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
-    add("--image-topic", help="colour image, raw or compressed")
-    add("--camera-info-topic", help='its CameraInfo; "none" for an unknown camera')
-    add("--depth-topic", help='ground truth (16UC1 mm or 32FC1 m); "none" for no scores')
+    _add_input_options(parser)
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
     add("--max-frames", type=_positive, help="stop after so many frames")
     add("--stride", type=_positive, default=1, help="take every N-th frame")
     add("--num-tokens", type=_positive, help="resolution inside the model")
     add("--device", default="cpu", help="cpu, cuda, cuda:N")
-    add("--threads", type=_positive, help="CPU threads for inference")
+    add(
+        "--threads",
+        type=_count,
+        default=THREADS,
+        help="CPU threads for inference, to which the last bits of the result belong "
+        f"(default: {THREADS}; 0: torch's own choice)",
+    )
     add("--depth-max", type=_distance, default=math.inf, help="cap of the ground truth, metres")
-    add("--tolerance", type=_distance, default=0.02, help="seconds from image to ground truth")
     add(
         "--scene-cut-threshold",
         type=_distance,
@@ -91,7 +106,56 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
         help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
     )
     add("--no-output-recording", dest="output_recording", action="store_false")
-    return Options(**vars(parser.parse_args(arguments)))
+    found = vars(parser.parse_args(arguments))
+    topics = tuple(found.pop("image_topics"))
+    if topics and found["all_topics"]:
+        parser.error("--all-topics does not go with --image-topic")
+    if len(topics) == 1:
+        return Options(**found, image_topic=topics[0])
+    return Options(**found, image_topics=topics)
+
+
+def _add_input_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--image-topic",
+        dest="image_topics",
+        action="append",
+        default=[],
+        metavar="TOPIC",
+        help="colour image, raw or compressed; may be given several times, see --all-topics",
+    )
+    add(
+        "--all-topics",
+        action="store_true",
+        help="replay every colour image topic, a stream and a folder below --out for each",
+    )
+    add("--camera-info-topic", help='its CameraInfo; "none" for an unknown camera')
+    add(
+        "--depth-topic",
+        help='ground truth: depth images (16UC1 mm, 32FC1 m, compressed) or a PointCloud2; "none" '
+        "for no scores",
+    )
+    add("--depth-info-topic", help="CameraInfo of a depth camera that is not the image's")
+    add(
+        "--depth-transform",
+        metavar="'X Y Z QX QY QZ QW'",
+        help="pose of the depth camera or of the cloud's sensor in the image's optical frame",
+    )
+    add("--tolerance", type=_distance, default=0.02, help="seconds from image to ground truth")
+    add(
+        "--stamps",
+        choices=("header", "log"),
+        default="header",
+        help="times from the messages' headers, or the times of recording",
+    )
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} must not be negative")
+    return value
 
 
 def _positive(text: str) -> int:
@@ -120,24 +184,46 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
 
     Raises RecordingError for a recording that cannot be used, and what load_model raises.
     """
-    if options.threads is not None:
-        import torch
-
-        torch.set_num_threads(options.threads)
     recording = open_recording(
         options.recording,
         options.image_topic,
         options.camera_info_topic,
         options.depth_topic,
         options.tolerance,
+        depth_info_topic=options.depth_info_topic,
+        depth_transform=options.depth_transform,
+        stamps=options.stamps,
     )
     model = loader(options.model, options.device)
     options.out.mkdir(parents=True, exist_ok=True)
-    evaluation = _run(options, recording, model)
+    with computing_threads(options.threads) as threads:
+        evaluation = _run(options, recording, model)
     if evaluation.frames == 0:
         reasons = "; ".join(recording.notes.losses) or "it holds no frames"
         raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
-    return _write_results(options, recording, model, evaluation)
+    return _write_results(options, recording, model, evaluation, threads)
+
+
+def split(options: Options) -> list[Options]:
+    """One Options per image topic when there are several, each with a folder of its own.
+
+    Raises RecordingError as image_topics does.
+    """
+    topics = options.image_topics
+    if options.all_topics:
+        topics = tuple(topic for topic in image_topics(options.recording) if topic)
+    if not topics:
+        return [replace(options, all_topics=False)]
+    return [
+        replace(
+            options,
+            image_topic=topic,
+            image_topics=(),
+            all_topics=False,
+            out=options.out / topic.strip("/").replace("/", "_"),
+        )
+        for topic in topics
+    ]
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -194,7 +280,11 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
 
 
 def _write_results(
-    options: Options, recording: Recording, model: GeometryModel, evaluation: SequenceEvaluation
+    options: Options,
+    recording: Recording,
+    model: GeometryModel,
+    evaluation: SequenceEvaluation,
+    threads: int,
 ) -> dict[str, Any]:
     results = evaluation.results()
     metrics = {
@@ -214,6 +304,10 @@ def _write_results(
             "max_frames": options.max_frames,
             "num_tokens": options.num_tokens,
             "scene_cut_threshold": options.scene_cut_threshold,
+            "stamps": options.stamps,
+            "tolerance": options.tolerance,
+            "depth_transform": options.depth_transform,
+            "threads": threads,
             "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
         },
     }
@@ -282,13 +376,24 @@ def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> 
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     options = parse(arguments)
     try:
-        metrics = replay(options, loader)
-    except (RecordingError, ValueError, OSError) as error:
+        codes = [_replay_and_tell(one, loader) for one in split(options)]
+    except RecordingError as error:
         print(f"dyfn-replay: {error}", file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
         print("dyfn-replay: interrupted, nothing was written", file=sys.stderr)
         return 130
+    if len(set(codes)) == 1:
+        return codes[0]
+    return PARTIAL  # of several topics, some were damaged or unusable
+
+
+def _replay_and_tell(options: Options, loader: ModelLoader) -> int:
+    try:
+        metrics = replay(options, loader)
+    except (RecordingError, ValueError, OSError) as error:
+        print(f"dyfn-replay: {error}", file=sys.stderr)
+        return UNUSABLE
     notes = metrics["recording"]
     for kind in ("losses", "warnings"):
         for text, count in notes[kind].items():
