@@ -19,8 +19,8 @@ def nearest_pixels(
     k = check_camera_matrix(camera_matrix)
     height, width = size
     with np.errstate(over="ignore"):
-        u = np.rint(points[:, 0] / points[:, 2] * k[0, 0] + k[0, 2])
-        v = np.rint(points[:, 1] / points[:, 2] * k[1, 1] + k[1, 2])
+        u = np.floor(points[:, 0] / points[:, 2] * k[0, 0] + k[0, 2] + 0.5)
+        v = np.floor(points[:, 1] / points[:, 2] * k[1, 1] + k[1, 2] + 0.5)
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return v[inside].astype(int), u[inside].astype(int), inside
 

@@ -25,7 +25,7 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 def shade(index: int) -> np.ndarray:
     """Noise, so that it does not compress, with the number in its first pixel."""
     image = np.random.default_rng(index).integers(0, 255, (*SIZE, 3), np.uint8)
-    image[0, 0] = index
+    image[0, 0] = index % 256
     return image
 
 

@@ -3,6 +3,7 @@
 import shutil
 import sqlite3
 import struct
+import tracemalloc
 from contextlib import closing
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from made_recordings import (
 from dyfn_ros.chunked_file import MAX_OPEN, Span, merged
 from dyfn_ros.recorded import MOST_LOSSES, Recorded, decompress
 from dyfn_ros.recording_writer import IMAGE, RecordingError
+from dyfn_ros.recordings import open_recording
 from dyfn_ros.storage import is_recording, open_storage
 
 COUNT = 24
@@ -281,3 +283,21 @@ def test_of_very_many_losses_the_first_are_told(tmp_path: Path) -> None:
     found, losses = indices(path)
     assert 40 < len(found) < 60
     assert len(losses) == MOST_LOSSES + 1 and losses[-1].startswith("and ")
+
+
+LONG = 300
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "zstd.mcap", "unindexed.mcap", "bz2.bag"])
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path, kind: str) -> None:
+    """The replay's own reading: frames, not only messages."""
+    most = {}
+    for count in (LONG // 10, LONG):
+        (tmp_path / str(count)).mkdir()
+        recording = open_recording(make(tmp_path / str(count), kind, count))
+        tracemalloc.start()
+        assert sum(1 for _ in recording.frames()) == count
+        most[count] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    images = LONG * len(image_bytes(0))
+    assert most[LONG] - most[LONG // 10] < images / 10
