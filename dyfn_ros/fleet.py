@@ -20,7 +20,8 @@ from tqdm import tqdm
 from dyfn_ros.finished_file import finished_file
 from dyfn_ros.fleet_summary import Row, write_summary
 from dyfn_ros.recording_writer import RecordingError
-from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, ModelLoader, Options, load, replay
+from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, ModelLoader, load, replay
+from dyfn_ros.replay_options import Options, split
 from dyfn_ros.rgbd_folder import is_rgbd_folder
 
 if TYPE_CHECKING:
@@ -30,8 +31,8 @@ CRASHED = 1  # the code of a recording whose worker died, or failed in a way tha
 USABLE = (ALL, PARTIAL)
 RECORDING_FILE = re.compile(r"(?P<name>.+)\.(mcap|db3|bag)(\.zstd)?")
 PART = re.compile(r"(?P<name>.*)_\d+")
-# Where the results go and how fast they come: the results are the same.
-FREE_OPTIONS = ("recording", "out", "progress", "threads")
+# Where the results go and what is shown meanwhile: the results are the same.
+FREE_OPTIONS = ("recording", "out", "progress")
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class Job:
-    """One recording to replay. name: of its folder and row. key: of all that decides the result."""
+    """One image topic of a recording to replay. name: of its folder and row. key: of all that decides the result."""
 
     name: str
     options: Options
@@ -118,7 +119,7 @@ def _is_recording(folder: Path) -> bool:
 
 
 def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Job]:
-    """A job per recording, each with a folder of its own under options.out."""
+    """A job per recording and image topic, each with a folder of its own under options.out."""
     jobs: list[Job] = []
     taken: set[str] = set()
     for recording in recordings:
@@ -131,9 +132,17 @@ def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Jo
             number, free = number + 1, f"{name}-{number}"
         taken.add(free)
         own = replace(options, recording=path, out=options.out.absolute() / free, progress=False)
-        own = replace(own, threads=options.threads or 1)
-        jobs.append(Job(free, own, _key(own, checksum)))
+        for one in _topics(own):
+            part = one.out.relative_to(own.out)
+            jobs.append(Job(str(Path(free) / part), one, _key(one, checksum)))
     return jobs
+
+
+def _topics(options: Options) -> list[Options]:
+    try:
+        return split(options)
+    except RecordingError:  # the replay of it says why, and the others go on
+        return [options]
 
 
 def _key(options: Options, checksum: str) -> str:

@@ -37,21 +37,12 @@ class Transform:
         return points @ self.rotation.T + self.translation
 
 
-def parse_transform(text: str, kind: str) -> Transform:
-    """ "x y z qx qy qz qw" (commas allowed), the sensor's pose in the camera's optical frame.
+def parse_pose(text: str, name: str) -> Transform:
+    """ "x y z qx qy qz qw" (commas allowed), a sensor's pose in the camera's optical frame.
 
-    "" is the camera's own place: optical axes for PointCloud2, those of REP 103 (x forward) for
-    LaserScan and Range. A depth Image is registered to the camera and has none.
-    Raises ValueError that says what was expected.
+    name: of the setting, for the error. Raises ValueError that says what was expected.
     """
-    if kind not in REFERENCE_TYPES:
-        raise ValueError(f"reference_type is {kind!r}, expected one of {REFERENCE_TYPES}")
-    if not text.strip():
-        turned = kind in ("LaserScan", "Range")
-        return Transform(_BODY_TO_OPTICAL if turned else np.eye(3), np.zeros(3))
-    expected = f"reference_transform is {text!r}, expected seven numbers 'x y z qx qy qz qw'"
-    if kind == "Image":
-        raise ValueError(f"{expected[: expected.index(',')]}, but a depth Image must be registered")
+    expected = f"{name} is {text!r}, expected seven numbers 'x y z qx qy qz qw'"
     try:
         values = np.array([float(part) for part in text.replace(",", " ").split()])
     except ValueError as error:
@@ -62,6 +53,23 @@ def parse_transform(text: str, kind: str) -> Transform:
     if abs(norm - 1) > 1e-2:
         raise ValueError(f"{expected} with a quaternion of length 1, not {norm:.3f}")
     return Transform(_rotation(values[3:] / norm), values[:3])
+
+
+def parse_transform(text: str, kind: str) -> Transform:
+    """The node's reference_transform, see parse_pose.
+
+    "" is the camera's own place: optical axes for PointCloud2, those of REP 103 (x forward) for
+    LaserScan and Range. A depth Image is registered to the camera and has none.
+    Raises ValueError that says what was expected.
+    """
+    if kind not in REFERENCE_TYPES:
+        raise ValueError(f"reference_type is {kind!r}, expected one of {REFERENCE_TYPES}")
+    if not text.strip():
+        turned = kind in ("LaserScan", "Range")
+        return Transform(_BODY_TO_OPTICAL if turned else np.eye(3), np.zeros(3))
+    if kind == "Image":
+        raise ValueError(f"reference_transform is {text!r}, but a depth Image must be registered")
+    return parse_pose(text, "reference_transform")
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from typing import Any
 from dyfn_ros.metric_parameters import SCALE, MetricSettings
 from dyfn_ros.parameter_spec import CONFIGURE, MARKS, RUN, START, Spec
 from dyfn_ros.parameter_spec import parameter as _parameter
+from dyfn_ros.threads import THREADS
 
 __all__ = [
     "CONFIGURE",
@@ -49,7 +50,10 @@ class Settings(MetricSettings):
         _NODE, "auto", "Where to run: auto (a GPU if there is one), cpu, cuda, cuda:N."
     )
     threads: int = _parameter(
-        _NODE, 0, "CPU threads for inference; 0 leaves the default.", range=(0, 1024)
+        _NODE,
+        THREADS,
+        "CPU threads for inference, to which the last bits of depth belong; 0 leaves torch's own.",
+        range=(0, 1024),
     )
     batch: bool = _parameter(
         _NODE,

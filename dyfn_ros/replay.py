@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
@@ -19,142 +17,18 @@ from dyfn_core.evaluation.report import text_table
 from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.replay_outputs import (
-    DEFAULT,
-    FILES,
-    VOXEL,
-    OutputOptions,
-    ReplayOutputs,
-    parse_outputs,
-)
-from dyfn_ros.replay_results import run_name, write_results
+from dyfn_ros.replay_options import Command, Options, parse, split
+from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
+from dyfn_ros.replay_results import Result, results_by_name, write_results
 from dyfn_ros.replay_video import Alignment
 from dyfn_ros.scene_cut import SceneCutHook
+from dyfn_ros.threads import computing_threads
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
 ALL, UNUSABLE, PARTIAL = 0, 2, 3  # exit codes; argparse also ends with 2
 ModelLoader = Callable[[str, str], "GeometryModel"]
-
-
-@dataclass(frozen=True)
-class Options:
-    """What to replay and how; see the command's --help."""
-
-    recording: Path
-    out: Path
-    model: str = "dyfn-mini"
-    image_topic: str | None = None
-    camera_info_topic: str | None = None
-    depth_topic: str | None = None
-    stabilizer: bool = True
-    max_frames: int | None = None
-    stride: int = 1
-    num_tokens: int | None = None
-    device: str = "cpu"
-    threads: int | None = None
-    depth_max: float = math.inf
-    tolerance: float = 0.02
-    scene_cut_threshold: float = 0.0
-    write: tuple[str, ...] = DEFAULT
-    pose_topic: str | None = None
-    voxel: float = VOXEL
-    progress: bool = True
-
-
-@dataclass(frozen=True)
-class Command:
-    """options: of every recording (its own is the first). recordings: as they were given.
-
-    jobs, ray: see fleet.FleetOptions.
-    """
-
-    options: Options
-    recordings: tuple[Path, ...]
-    jobs: int
-    ray: str | None
-
-
-def parse(arguments: Sequence[str] | None = None) -> Command:
-    """Command line -> Command; ends the process with code 2 on a wrong one."""
-    parser = argparse.ArgumentParser(
-        prog="dyfn-replay",
-        description="Run recordings through the model, as the node would, and score them.",
-        epilog="Exit code: 0 everything was read, 3 part of the recording was damaged and the "
-        "rest was used, 2 nothing usable (the reason is on stderr). Of several recordings: 0 all "
-        "are whole, 3 some are partial or failed, 2 none gave results.",
-    )
-    add = parser.add_argument
-    add(
-        "recordings",
-        type=Path,
-        nargs="+",
-        metavar="recording",
-        help="rosbag2 folder, .mcap or .db3 file, RGB-D folder; several, a folder of them, or a "
-        ".txt file that lists them",
-    )
-    add("--out", type=Path, required=True, help="folder for the results")
-    add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
-    add("--image-topic", help="colour image, raw or compressed")
-    add("--camera-info-topic", help='its CameraInfo; "none" for an unknown camera')
-    add("--depth-topic", help='ground truth (16UC1 mm or 32FC1 m); "none" for no scores')
-    add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
-    add("--max-frames", type=_positive, help="stop after so many frames")
-    add("--stride", type=_positive, default=1, help="take every N-th frame")
-    add("--num-tokens", type=_positive, help="resolution inside the model")
-    add("--device", default="cpu", help="cpu, cuda, cuda:N")
-    add("--threads", type=_positive, help="CPU threads for inference")
-    add("--depth-max", type=_distance, default=math.inf, help="cap of the ground truth, metres")
-    add("--tolerance", type=_distance, default=0.02, help="seconds from image to ground truth")
-    add(
-        "--scene-cut-threshold",
-        type=_distance,
-        default=0.0,
-        help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
-    )
-    _add_output_options(parser)
-    add("--jobs", type=_positive, default=1, help="processes for several recordings")
-    add("--ray", metavar="ADDRESS", help='Ray cluster for several recordings; "local" makes one')
-    given = vars(parser.parse_args(arguments))
-    recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
-    return Command(Options(recordings[0], **given), tuple(recordings), jobs, ray)
-
-
-def _add_output_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--write",
-        type=_outputs,
-        default=DEFAULT,
-        metavar="LIST",
-        help=f"files beside scores and report: some of {','.join(FILES)}, or none "
-        f"(default: {','.join(DEFAULT)})",
-    )
-    add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
-    add("--pose-topic", help='poses, odometry or TF for cloud.ply; "none" for no cloud')
-    add("--voxel", type=_distance, default=VOXEL, help="voxels of cloud.ply, metres")
-
-
-def _outputs(text: str) -> tuple[str, ...]:
-    try:
-        return parse_outputs(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
-    return value
-
-
-def _distance(text: str) -> float:
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text} must be above 0")
-    return value
 
 
 def load(name: str, device: str) -> GeometryModel:
@@ -165,28 +39,42 @@ def load(name: str, device: str) -> GeometryModel:
 
 
 def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
-    """Replay a recording and write everything into options.out; returns metrics.json's content.
+    """Replay one image topic and write everything into options.out; -> metrics.json's content.
 
-    Raises RecordingError for a recording that cannot be used, and what load_model raises.
+    Raises RecordingError for a recording that cannot be used, OutputError for a file that cannot
+    be written, and what load_model raises.
     """
-    if options.threads is not None:
-        import torch
+    recording = _open(options)
+    model = loader(options.model, options.device)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with computing_threads(options.threads) as threads:
+        evaluation, outputs = _run(options, recording, model)
+        if evaluation.frames == 0:
+            reasons = "; ".join(recording.notes.losses) or "it holds no frames"
+            raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
+        base = _run_base(options, model) if options.compare else None
+    result = Result(recording, model, evaluation, base, threads, outputs.cloud)
+    return write_results(options, result)
 
-        torch.set_num_threads(options.threads)
-    recording = open_recording(
+
+def _open(options: Options) -> Recording:
+    return open_recording(
         options.recording,
         options.image_topic,
         options.camera_info_topic,
         options.depth_topic,
         options.tolerance,
+        depth_info_topic=options.depth_info_topic,
+        depth_transform=options.depth_transform,
+        stamps=options.stamps,
     )
-    model = loader(options.model, options.device)
-    options.out.mkdir(parents=True, exist_ok=True)
-    evaluation = _run(options, recording, model)
-    if evaluation.frames == 0:
-        reasons = "; ".join(recording.notes.losses) or "it holds no frames"
-        raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
-    return write_results(options, recording, model, evaluation)
+
+
+def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | None:
+    """The same frames without DyFN, nothing but their evaluation kept; None without DyFN."""
+    if not options.stabilizer or model.stabilizer is None:
+        return None
+    return _run(replace(options, stabilizer=False, write=()), _open(options), model)[0]
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -197,7 +85,9 @@ def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFr
     return islice(frames, options.max_frames), expected
 
 
-def _run(options: Options, recording: Recording, model: GeometryModel) -> SequenceEvaluation:
+def _run(
+    options: Options, recording: Recording, model: GeometryModel
+) -> tuple[SequenceEvaluation, ReplayOutputs]:
     cuts = SceneCutHook(lambda: options.scene_cut_threshold)
     camera = CameraStream(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
@@ -236,7 +126,7 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
         video, quantity = evaluation.video(), model.quantity
         alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
         outputs.finish(alignment, quantity)
-    return evaluation
+    return evaluation, outputs
 
 
 def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
@@ -265,20 +155,27 @@ def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> 
 def _replay_command(command: Command, loader: ModelLoader) -> int:
     from dyfn_ros import fleet  # which is above this module
 
-    options = command.options
     if fleet.is_many(command.recordings):
         chosen = fleet.FleetOptions(command.jobs, command.ray)
-        return fleet.replay_all(fleet.expand(command.recordings), options, chosen, loader)
-    metrics = replay(options, loader)
+        recordings = fleet.expand(command.recordings)
+        return fleet.replay_all(recordings, command.options, chosen, loader)
+    codes = {_replay_and_tell(one, loader) for one in split(command.options)}
+    return codes.pop() if len(codes) == 1 else PARTIAL
+
+
+def _replay_and_tell(options: Options, loader: ModelLoader) -> int:
+    try:
+        metrics = replay(options, loader)
+    except (RecordingError, ValueError, OSError) as error:
+        print(f"dyfn-replay: {error}", file=sys.stderr)
+        return UNUSABLE
     notes = metrics["recording"]
-    for kind in ("losses", "warnings"):
+    for kind, word in (("losses", "loss"), ("warnings", "warning")):
         for text, count in notes[kind].items():
             times = f" ({count} times)" if count > 1 else ""
-            print(
-                f"dyfn-replay: {kind[:-1].replace('losse', 'loss')}: {text}{times}", file=sys.stderr
-            )
+            print(f"dyfn-replay: {word}: {text}{times}", file=sys.stderr)
     print(f"{metrics['frames']} frames of {options.recording}")
-    print(text_table(score_table({run_name(metrics): metrics})))
+    print(text_table(score_table(results_by_name(metrics))))
     written = [name for name in FILES.values() if (options.out / name).exists()]
     listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
     print(f"results in {options.out}: {listed}")

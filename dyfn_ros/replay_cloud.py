@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dyfn_core.evaluation.cloud_pictures import draw_fused
+from dyfn_core.geometry.registration import Similarity
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_ros.finished_file import finished_file
 from dyfn_ros.frame_spool import FrameSpool, SmallFrame
@@ -14,26 +16,29 @@ from dyfn_ros.replay_video import Alignment
 
 def write_cloud(
     path: Path, spool: FrameSpool, alignment: Alignment, voxel: float, depth_max: float
-) -> str | None:
+) -> tuple[np.ndarray | None, str]:
     """Fuse the frames that have a pose into a coloured binary PLY, in metres of the poses' world.
 
     voxel: edge of a voxel in metres; it doubles while the cloud would be too large.
     depth_max: metres, farther points are left out. Flying pixels at depth edges are left out.
-    Returns what to warn about, if anything. Raises OutputError.
+    Returns the cloud and the camera's path from above (H x W x 3 uint8 RGB, None without a point),
+    and what to warn about, "" for nothing. Raises OutputError.
     """
     import trimesh  # slow to import
 
     grid = VoxelGrid(voxel)
+    poses: list[Similarity] = []
     lost = 0
     for frame in spool:
         if frame.pose is None:
             lost += 1
             continue
         grid.add(*world_points(frame, alignment, depth_max))
+        poses.append(Similarity.from_matrix(frame.pose))
     points, colours = grid.cloud()
     if len(points) == 0:
         path.unlink(missing_ok=True)  # of an earlier run
-        return f"no {path.name}: {spool.frames} frames, {lost} without a pose, gave no point"
+        return None, f"no {path.name}: {spool.frames} frames, {lost} without a pose, gave no point"
     cloud = trimesh.PointCloud(points, colours)
     with finished_file(path) as partial:
         partial.write_bytes(cloud.export(file_type="ply"))
@@ -44,7 +49,8 @@ def write_cloud(
         notes.append(f"voxels grew from {voxel:g} to {grid.size:g} m to bound its size")
     if grid.outside:
         notes.append(f"{grid.outside} points too far from the origin are left out")
-    return f"{path.name}: {'; '.join(notes)}" if notes else None
+    note = f"{path.name}: {'; '.join(notes)}" if notes else ""
+    return draw_fused(points, colours, poses), note
 
 
 def world_points(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -26,7 +27,8 @@ from dyfn_ros.replay_video import Alignment, write_video
 
 MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
 FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}
-DEFAULT = (MCAP, PLY, VIDEO)
+# The video comes by itself only where the extra `video` is installed.
+DEFAULT = (MCAP, PLY, VIDEO) if importlib.util.find_spec("av") else (MCAP, PLY)
 NONE = "none"
 VOXEL = 0.02  # metres
 
@@ -61,7 +63,8 @@ class ReplayOutputs:
     """Takes a replay's frames and leaves the chosen files in a folder, each only when complete.
 
     recording: what is replayed; its poses are looked for in it. warn: takes a reason for what is
-    not written, or not whole. After an exception none of the files is left behind. Raises
+    not written, or not whole. After an exception none of the files is left behind. cloud: after
+    finish, the fused cloud seen from above (H x W x 3 uint8 RGB), if there is one. Raises
     OutputError for a file that cannot be written, or a library that is missing.
     """
 
@@ -80,6 +83,7 @@ class ReplayOutputs:
         self._fuse = PLY in options.write
         self._done = {MCAP, RRD} & set(options.write)
         self._stack = ExitStack()
+        self.cloud: np.ndarray | None = None
 
     def __enter__(self) -> ReplayOutputs:
         with ExitStack() as stack:
@@ -140,7 +144,9 @@ class ReplayOutputs:
         if alignment is None:
             note = "no cloud.ply: depth is up to scale, and no ground truth gives its metres"
         else:
-            note = write_cloud(path, spool, alignment, options.voxel, options.depth_max) or ""
+            self.cloud, note = write_cloud(
+                path, spool, alignment, options.voxel, options.depth_max
+            )
             self._done.add(PLY)
         self._notes += [note] if note else []
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dyfn_core.evaluation.pictures import MAX_ERROR, colour_depth, colour_error, depth_range
 from dyfn_core.evaluation.protocols import align_depth
-from dyfn_ros.finished_file import finished_file
+from dyfn_ros.finished_file import OutputError, finished_file
 from dyfn_ros.frame_spool import FrameSpool, SmallFrame
 
 CODEC = "libx264"
@@ -41,7 +41,12 @@ def write_video(path: Path, spool: FrameSpool, alignment: Alignment) -> None:
     One alignment and one range of colours for all frames, so that drift and flicker are seen;
     the error panel is there when any frame has truth. Raises OutputError.
     """
-    import av  # loads ffmpeg's libraries: not for --help
+    try:
+        import av  # loads ffmpeg's libraries: not for --help
+    except ImportError as error:
+        raise OutputError(
+            f"--write video needs PyAV ({error}): install this package with its `video` extra"
+        ) from error
 
     colours = _Colours(spool, alignment)
     with (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -25,11 +25,14 @@ def numbered(folder: Path, suffixes: set[str]) -> list[Path]:
     return sorted(files, key=lambda f: ([int(n) for n in re.findall(r"\d+", f.stem)], f.name))
 
 
-def read_rgbd_folder(path: str | Path, rate: float = 10.0) -> Iterator[RgbdFrame]:
+def read_rgbd_folder(
+    path: str | Path, rate: float = 10.0, lose: Callable[[str], None] | None = None
+) -> Iterator[RgbdFrame]:
     """Frames of `rgb/*.jpg|png` with `depth/<same name>.png`, stamped 0, 1/rate, 2/rate ...
 
     depth: uint16 millimetres, 0 = none. `K.txt`: 3 x 3 intrinsics in pixels. `poses.txt`: a
     row-major 4 x 4 camera-to-world matrix a line, one per colour frame. All three are optional.
+    lose: takes what is wrong with a picture, which is then left out; the stamps stay.
     Raises RecordingError naming the file that is missing, unreadable or of the wrong shape.
     """
     folder = Path(path)
@@ -39,9 +42,12 @@ def read_rgbd_folder(path: str | Path, rate: float = 10.0) -> Iterator[RgbdFrame
     camera_matrix = _matrix(folder / "K.txt", (3, 3))
     poses = _matrix(folder / "poses.txt", (len(files), 4, 4))
     for index, file in enumerate(files):
+        image = _attempt(_colour, file, lose)
+        if image is None:
+            continue
         yield RgbdFrame(
-            image=_colour(file),
-            depth_m=_depth(folder / "depth" / f"{file.stem}.png"),
+            image=image,
+            depth_m=_attempt(_depth, folder / "depth" / f"{file.stem}.png", lose),
             camera_matrix=camera_matrix,
             pose=None if poses is None else poses[index],
             stamp=index / rate,
@@ -54,6 +60,18 @@ def read_poses(folder: Path) -> np.ndarray | None:
     Raises RecordingError when it has another number of rows than there are colour images.
     """
     return _matrix(folder / "poses.txt", (len(numbered(folder / "rgb", IMAGE_SUFFIXES)), 4, 4))
+
+
+def _attempt(
+    read: Callable[[Path], np.ndarray | None], file: Path, lose: Callable[[str], None] | None
+) -> np.ndarray | None:
+    try:
+        return read(file)
+    except RecordingError as error:
+        if lose is None:
+            raise
+        lose(str(error))
+        return None
 
 
 def _matrix(file: Path, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -1,220 +1,43 @@
-"""Messages out of rosbag2 folders and bare MCAP and sqlite3 files, also damaged ones."""
+"""Recordings of every kind opened: rosbag2 folders, bare MCAP, sqlite3 and ROS 1 files."""
 
 from __future__ import annotations
 
 import re
-import sqlite3
-import struct
-import sys
-from collections import Counter
-from collections.abc import Collection, Iterator
-from contextlib import closing
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+import shutil
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Sequence
+from pathlib import Path, PurePath
 
-import apsw
+import yaml
 import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
-from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.serde import SerdeError
 
-from dyfn_ros.recording_writer import TYPES, RecordingError
+from dyfn_ros.bag1_file import Bag1File
+from dyfn_ros.mcap_file import McapFile
+from dyfn_ros.recorded import DAMAGE, Recorded, Storage, Topic, reason
+from dyfn_ros.recording_writer import RecordingError
+from dyfn_ros.sqlite_file import SqliteFile
 
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+__all__ = ["SUFFIXES", "Recorded", "Storage", "Topic", "is_recording", "open_storage"]
 
-# What the readers are known to raise on bytes that are no longer what was written.
-DAMAGE = (
-    ReaderError,
-    SerdeError,
-    McapError,
-    zstandard.ZstdError,
-    zstd.ZstdError,
-    apsw.Error,
-    sqlite3.Error,
-    struct.error,
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    LookupError,
-    RuntimeError,
-    AssertionError,
-)
-
-
-class Recorded(NamedTuple):
-    """One message: log_ns is when it was recorded, data is its CDR bytes."""
-
-    topic: str
-    kind: str
-    log_ns: int
-    data: bytes
-
-    def message(self) -> Any:
-        """The deserialised message. Raises RecordingError when the bytes are not its type."""
-        try:
-            return TYPES.deserialize_cdr(self.data, self.kind)
-        except DAMAGE as error:
-            raise RecordingError(f"{self.topic}: cannot read as {self.kind}: {error!r}") from error
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A topic of a recording: message type and how many messages can be read."""
-
-    kind: str
-    count: int
-
-
-class Storage(Protocol):
-    """An opened recording.
-
-    topics: name -> Topic.
-    """
-
-    topics: dict[str, Topic]
-
-    @property
-    def losses(self) -> list[str]:
-        """What could not be read, one sentence each; complete after messages() is exhausted."""
-
-    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
-        """Messages of these topics in log-time order; equal times in the order of recording."""
-
-
-class IntactStorage:
-    """A folder or file whose index can be read."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.losses: list[str] = []
-        self._reader = Reader(path)  # stays open: opening a folder parses YAML for 0.3 s
-        self._reader.open()
-        self.topics: dict[str, Topic] = {}
-        for connection in self._reader.connections:
-            known = self.topics.get(connection.topic, Topic(connection.msgtype, 0))
-            count = known.count + connection.msgcount
-            self.topics[connection.topic] = Topic(known.kind, count)
-
-    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
-        """See Storage. Damage on the way ends the iteration and is added to the losses."""
-        last = None
-        chosen = [c for c in self._reader.connections if c.topic in topics]
-        found = self._reader.messages(chosen) if chosen else iter(())
-        while True:
-            try:
-                connection, last, data = next(found)
-            except StopIteration:
-                return
-            except DAMAGE as error:
-                when = "from the start" if last is None else f"after log time {last / 1e9:.3f} s"
-                self.losses = [f"{self.path}: unreadable {when}: {error}"]
-                return
-            yield Recorded(connection.topic, connection.msgtype, last, bytes(data))
-
-
-class LinearMcap:
-    """An MCAP without a usable index: read from its start to the first bad record.
-
-    Messages come in log-time order within each chunk, chunks as they were written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.losses: list[str] = []
-        counts: Counter[tuple[str, str]] = Counter()
-        for recorded in self._scan():
-            counts[recorded.topic, recorded.kind] += 1
-        self.topics = {topic: Topic(kind, count) for (topic, kind), count in counts.items()}
-
-    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
-        """See Storage."""
-        return (recorded for recorded in self._scan() if recorded.topic in topics)
-
-    def _scan(self) -> Iterator[Recorded]:
-        self.losses = []
-        size = self.path.stat().st_size
-        good = 0
-        schemas: dict[int, str] = {}
-        channels: dict[int, Channel] = {}
-        with self.path.open("rb") as file:
-            records = iter(StreamReader(file, emit_chunks=True, record_size_limit=size).records)
-            while True:
-                try:
-                    record = next(records, None)
-                    if record is None or isinstance(record, Footer):
-                        return
-                    yield from _decode(record, schemas, channels)
-                except DAMAGE as error:
-                    reason = f"{type(error).__name__} {error}".strip()
-                    self.losses = [
-                        f"{self.path}: read up to byte {good} of {size} ({good / size:.0%}), "
-                        f"the rest is damaged or missing ({reason})"
-                    ]
-                    return
-                good = file.tell()
-
-
-def _decode(
-    record: McapRecord, schemas: dict[int, str], channels: dict[int, Channel]
-) -> list[Recorded]:
-    """Remember schemas and channels; return the messages of a record in log-time order."""
-    found = []
-    for part in breakup_chunk(record, True) if isinstance(record, Chunk) else [record]:
-        if isinstance(part, Schema):
-            schemas[part.id] = part.name
-        elif isinstance(part, Channel):
-            channels[part.id] = part
-        elif isinstance(part, Message) and channels[part.channel_id].message_encoding == "cdr":
-            channel = channels[part.channel_id]
-            kind = schemas.get(channel.schema_id, "")
-            found.append(Recorded(channel.topic, kind, part.log_time, part.data))
-    return sorted(found, key=lambda recorded: recorded.log_ns)
-
-
-class LinearSqlite:
-    """A sqlite3 recording that cannot be indexed: rows in order up to the first bad page."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.losses: list[str] = []
-        counts: Counter[tuple[str, str]] = Counter()
-        for recorded in self._scan():
-            counts[recorded.topic, recorded.kind] += 1
-        self.topics = {topic: Topic(kind, count) for (topic, kind), count in counts.items()}
-
-    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
-        """See Storage."""
-        return (recorded for recorded in self._scan() if recorded.topic in topics)
-
-    def _scan(self) -> Iterator[Recorded]:
-        self.losses = []
-        count = 0
-        uri = f"{self.path.absolute().as_uri()}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(uri, uri=True)) as database:
-            try:
-                # Without this, sqlite refuses a file that is shorter than its header says.
-                database.execute("PRAGMA writable_schema = ON")
-                rows = database.execute("SELECT id, name, type FROM topics")
-                topics = {key: (name, kind) for key, name, kind in rows}
-                query = "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
-                for key, stamp, data in database.execute(query):
-                    count += 1
-                    yield Recorded(*topics[key], stamp, data)
-            except (sqlite3.Error, LookupError) as error:
-                self.losses = [f"{self.path}: {count} messages read, then: {error}"]
+READERS: dict[str, Callable[[Path], Storage]] = {
+    ".mcap": McapFile,
+    ".db3": SqliteFile,
+    ".bag": Bag1File,
+    ".active": Bag1File,  # a ROS 1 bag that was not closed: x.bag.active
+}
+SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active")
+PACKED = (".zstd", ".zst")  # rosbag2's compression by file
+EXPECTED = "a rosbag2 folder, an .mcap, .db3 or .bag file (also .zstd of one), or an RGB-D folder"
+_FREE = 1 << 30  # bytes that unpacking leaves on the disk
 
 
 class ChainedStorage:
-    """Several files of one recording, one after the other."""
+    """Several files of one recording, one after the other.
 
-    def __init__(self, parts: list[Storage], losses: list[str]) -> None:
+    losses: of what was no readable file at all.
+    """
+
+    def __init__(self, parts: Sequence[Storage], losses: Sequence[str] = ()) -> None:
         self.parts = parts
         self._lost = losses
         self.topics: dict[str, Topic] = {}
@@ -234,17 +57,31 @@ class ChainedStorage:
             yield from part.messages(topics)
 
 
-LINEAR: dict[str, type[LinearMcap] | type[LinearSqlite]] = {
-    ".mcap": LinearMcap,
-    ".db3": LinearSqlite,
-}
+class UnpackedStorage(ChainedStorage):
+    """A .zstd file, unpacked into a temporary folder that lives as long as this object."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="dyfn-")
+        inside = Path(self._folder.name) / path.stem
+        problem = _unpack(path, inside)
+        try:
+            super().__init__([_open_file(inside)], [f"{path}: {problem}"] if problem else [])
+        except RecordingError as error:
+            raise RecordingError(f"{path}: {problem or error}") from error
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path looks like a recording: by its name, or by what a folder holds."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or bool(_files(path))
+    return _is_file(path)
 
 
 def open_storage(path: str | Path) -> Storage:
-    """Open a rosbag2 folder (with or without metadata.yaml) or a bare .mcap or .db3 file.
+    """Open a rosbag2 folder (with or without metadata.yaml) or a bare file of SUFFIXES.
 
-    Where the index is unreadable, everything up to the damage is used and the loss is reported
-    in `losses`. Raises RecordingError when nothing can be read, saying what was expected.
+    What can be read is used, also behind damage, and the loss is reported in `losses`. Raises
+    RecordingError when nothing can be read, saying what was expected.
     """
     path = Path(path)
     if not path.exists():
@@ -256,20 +93,43 @@ def open_storage(path: str | Path) -> Storage:
     return storage
 
 
+def _is_file(path: Path) -> bool:
+    name = path.stem if path.suffix in PACKED else path.name
+    return name.endswith(SUFFIXES)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Recordings in a folder in natural order of their names, each once."""
+    found = {
+        (f.stem if f.suffix in PACKED else f.name): f
+        for f in sorted(folder.iterdir(), key=lambda f: f.suffix not in PACKED)
+        if _is_file(f) and f.is_file()
+    }
+    return sorted(found.values(), key=lambda f: _natural(f.name))
+
+
+def _natural(name: str) -> list[int | str]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+
+
 def _open_folder(path: Path) -> Storage:
-    files = sorted((f for f in path.iterdir() if f.suffix in LINEAR), key=_natural)
-    reason = ""
+    files, problem = _files(path), ""
+    losses: list[str] = []
     if (path / "metadata.yaml").exists():
         try:
-            return IntactStorage(path)
-        except DAMAGE as error:
-            reason = f": {error}"
+            listed = [path / name for name in _listed(path / "metadata.yaml")]
+            losses = [
+                f"{f}: missing, though metadata.yaml lists it" for f in listed if not f.exists()
+            ]
+            files = [f for f in listed if f.exists()] or files
+        except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
+            problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
     if not files:
         raise RecordingError(
             f"{path}: expected a rosbag2 folder (metadata.yaml and .mcap or .db3 files) "
-            f"or an RGB-D folder (rgb/, depth/, K.txt){reason}"
+            f"or an RGB-D folder (rgb/, depth/, K.txt){problem}"
         )
-    parts, losses = [], []
+    parts = []
     for file in files:
         try:
             parts.append(_open_file(file))
@@ -280,22 +140,43 @@ def _open_folder(path: Path) -> Storage:
     return ChainedStorage(parts, losses)
 
 
-def _natural(file: Path) -> list[int | str]:
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", file.name)]
+def _listed(metadata: Path) -> list[str]:
+    """File names in the order of recording; old versions have the folder's name before them."""
+    with metadata.open("rb") as file:
+        content = yaml.safe_load(file)
+    names = content["rosbag2_bagfile_information"]["relative_file_paths"]
+    return [PurePath(name).name for name in names]
 
 
 def _open_file(path: Path) -> Storage:
-    if path.suffix not in LINEAR:
-        raise RecordingError(
-            f"{path}: expected a rosbag2 folder, an .mcap or .db3 file, or an RGB-D folder"
-        )
+    if not _is_file(path):
+        raise RecordingError(f"{path}: expected {EXPECTED}")
     if path.stat().st_size == 0:
         raise RecordingError(f"{path} is empty")
+    if path.suffix in PACKED:
+        return UnpackedStorage(path)
     try:
-        return IntactStorage(path)
+        storage = READERS[path.suffix](path)
     except DAMAGE as error:
-        linear = LINEAR[path.suffix](path)
-        if not linear.topics:
-            reasons = "; ".join(linear.losses) or str(error)
-            raise RecordingError(f"{path} is not a readable recording: {reasons}") from error
-        return linear
+        raise RecordingError(f"{path} is not a readable recording: {reason(error)}") from error
+    if not storage.topics:
+        reasons = "; ".join(storage.losses) or "it holds no messages"
+        raise RecordingError(f"{path} is not a readable recording: {reasons}")
+    return storage
+
+
+def _unpack(path: Path, target: Path) -> str:
+    """Unpack as much as can be; says what went wrong, "" when nothing did."""
+    decoder = zstandard.ZstdDecompressor().decompressobj()
+    try:
+        with path.open("rb") as source, target.open("wb") as file:
+            while not decoder.eof:
+                piece = source.read(1 << 10)  # gives at most 32 MiB
+                if not piece:
+                    return "the compressed file ends early"
+                file.write(decoder.decompress(piece))
+                if shutil.disk_usage(target.parent).free < _FREE:
+                    return f"unpacked up to {file.tell()} bytes, then the disk was full"
+    except DAMAGE as error:
+        return f"unpacked in part: {reason(error)}"
+    return ""

@@ -4,24 +4,37 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from dyfn_ros.compressed_depth import is_compressed_depth
-from dyfn_ros.recording_writer import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, RecordingError
-from dyfn_ros.storage import Storage
+from dyfn_ros.recorded import Storage
+from dyfn_ros.recording_writer import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    POINT_CLOUD,
+    RecordingError,
+)
 
 NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}
+TRIES = 16  # messages of a topic, to see what it holds
 TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
 
 
 @dataclass(frozen=True)
 class Topics:
-    """image: colour, raw or compressed. camera_info, depth: None to do without."""
+    """image: colour, raw or compressed. camera_info, depth, depth_info: None to do without.
+
+    depth: images or clouds; depth_info: the CameraInfo of depth images that have their own.
+    """
 
     image: str
     camera_info: str | None
     depth: str | None
+    depth_info: str | None = None
 
 
 def choose_topics(
@@ -30,13 +43,15 @@ def choose_topics(
     image: str | None = None,
     camera_info: str | None = None,
     depth: str | None = None,
+    depth_info: str | None = None,
 ) -> Topics:
     """Take the named topics, and find the others by type when there is one candidate.
 
     An image counts as depth when its encoding is 16UC1 or 32FC1 (mono16 when its name says
     depth). A topic recorded both raw and compressed is one candidate: the raw one. Of several
-    CameraInfos, the sibling of the image topic is taken. Raises RecordingError: a named topic
-    that is absent or of another type, no image topic, several candidates.
+    CameraInfos, the sibling of the image topic is taken; of several depths, the one in the
+    image's namespace. A PointCloud2 is depth when it is named. Raises RecordingError: a named
+    topic that is absent or of another type, no image topic, several candidates.
     """
     kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
     colours, depths = _classify(storage, kinds)
@@ -44,11 +59,34 @@ def choose_topics(
     chosen = _named(path, kinds, image, images) or _only(path, kinds, colours, "image")
     if chosen is None:
         raise RecordingError(f"{path}: no colour image topic; it holds {_listing(kinds, kinds)}")
+    truth = _optional(
+        path,
+        kinds,
+        depth,
+        {*images, POINT_CLOUD},
+        _nearest([d for d in depths if d != chosen], chosen),
+    )
+    info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
+    images_own = truth is not None and kinds[truth] != POINT_CLOUD
+    own = [name for name in _siblings(kinds, truth or "") if images_own and name != info]
     return Topics(
         image=chosen,
-        camera_info=_optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen)),
-        depth=_optional(path, kinds, depth, images, [d for d in depths if d != chosen]),
+        camera_info=info,
+        depth=truth,
+        depth_info=_optional(path, kinds, depth_info, {CAMERA_INFO}, own),
     )
+
+
+def image_topics(path: Path, storage: Storage) -> list[str]:
+    """Every colour image topic, one of each that is recorded both raw and compressed.
+
+    Raises RecordingError when there is none.
+    """
+    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    colours, _ = _classify(storage, kinds)
+    if not colours:
+        raise RecordingError(f"{path}: no colour image topic; it holds {_listing(kinds, kinds)}")
+    return colours
 
 
 def _optional(
@@ -95,7 +133,9 @@ def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[
     for name, kind in sorted(kinds.items()):
         if kind not in (IMAGE, COMPRESSED_IMAGE):
             continue
-        message = next(iter(storage.messages([name]))).message()
+        message = _first(storage, name)
+        if message is None:
+            continue
         if kind == IMAGE:
             named = message.encoding == "mono16" and "depth" in name
             is_depth = message.encoding in DEPTH_ENCODINGS or named
@@ -108,6 +148,23 @@ def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[
     return _raw_first(colours), _raw_first(depths)
 
 
+def _first(storage: Storage, name: str) -> Any:
+    """The first message that can be read; None when none of the first few can."""
+    for recorded in islice(storage.messages([name]), TRIES):
+        try:
+            return recorded.message()
+        except RecordingError:  # counted when it is read as a frame
+            continue
+    return None
+
+
+def _nearest(depths: list[str], image: str) -> list[str]:
+    """The depths in the namespace of the image when that is one, else all."""
+    space = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/"
+    near = [name for name in depths if name.startswith(space)]
+    return near if len(near) == 1 else depths
+
+
 def _raw_first(names: list[str]) -> list[str]:
     """Drop the compressed twins of raw topics, and compressedDepth beside compressed."""
     kept: dict[str, str] = {}
@@ -118,6 +175,11 @@ def _raw_first(names: list[str]) -> list[str]:
 
 def _infos(kinds: dict[str, str], image: str) -> list[str]:
     """CameraInfo candidates; the image's sibling alone when it is there."""
-    infos = [name for name, kind in kinds.items() if kind == CAMERA_INFO]
+    infos = sorted(name for name, kind in kinds.items() if kind == CAMERA_INFO)
+    return _siblings(kinds, image) or infos
+
+
+def _siblings(kinds: dict[str, str], image: str) -> list[str]:
+    """The CameraInfo beside an image topic."""
     sibling = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/camera_info"
-    return [sibling] if sibling in infos else sorted(infos)
+    return [sibling] if kinds.get(sibling) == CAMERA_INFO else []

@@ -31,9 +31,9 @@ from dyfn_core.data.frames import (
     camera_intrinsics,
 )
 from dyfn_ros.recordings import RecordedFrame, RecordingError, open_recording
+from dyfn_ros.storage import is_recording
 
-EXPECTED = "a rosbag2 folder, .mcap or .db3 file with a colour and a depth image topic"
-SUFFIXES = (".mcap", ".db3")
+EXPECTED = "a rosbag2 folder, .mcap, .db3 or .bag file with a colour and a depth image topic"
 FORMAT = 1  # of the folder of pictures
 CACHE_VARIABLE = "DYFN_CACHE"
 JPEG_QUALITY = 95
@@ -85,15 +85,6 @@ def open_recording_kind(
         NumberedSequence(f"{root}[{run[0]}..{run[-1]}]", run, reader)
         for run in _runs({number: stamp for number, (stamp, _) in frames.items()}, max_gap)
     ]
-
-
-def is_recording(root: Path) -> bool:
-    """Whether a path looks like a recording."""
-    if root.is_dir():
-        return (root / "metadata.yaml").exists() or any(
-            path.suffix in SUFFIXES for path in root.iterdir()
-        )
-    return root.suffix in SUFFIXES
 
 
 def _runs(stamps: dict[int, int], max_gap: float) -> list[list[int]]:

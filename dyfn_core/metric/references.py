@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from dyfn_core.geometry.camera import check_camera_matrix
+from dyfn_core.geometry.projection import nearest_pixels
 
 MOST_POINTS = 400  # of one message; more say the same
 _EDGE = 1.2  # depths of neighbouring pixels that differ by more make an edge
@@ -72,14 +73,9 @@ class PointReference:
         points = _keep(points, finite, "missing", dropped)
         before = np.asarray(points[:, 2] > 1e-3)
         points = _keep(points, before, "behind the camera", dropped)
-        k = check_camera_matrix(view.camera_matrix)
         height, width = view.depth.shape
-        with np.errstate(over="ignore"):
-            u = np.rint(points[:, 0] / points[:, 2] * k[0, 0] + k[0, 2])
-            v = np.rint(points[:, 1] / points[:, 2] * k[1, 1] + k[1, 2])
-        inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        rows, columns, inside = nearest_pixels(points, view.camera_matrix, (height, width))
         dropped["outside the image"] += int((~inside).sum())
-        rows, columns = v[inside].astype(int), u[inside].astype(int)
         return _pairs(view, rows, columns, points[inside, 2], stamp, dropped)
 
 

@@ -20,7 +20,8 @@ from dyfn_ros.recording_writer import (
     image_message,
     write_rgbd_recording,
 )
-from dyfn_ros.recordings import RecordedFrame, RecordingError, open_recording
+from dyfn_ros.recordings import RecordedFrame, RecordingError, image_topics, open_recording
+from dyfn_ros.topics import Topics
 
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
 SIZE = (24, 32)
@@ -156,14 +157,21 @@ def test_several_cameras_are_listed_and_one_can_be_chosen(tmp_path: Path) -> Non
         open_recording(tmp_path / "bag")
     assert "--image-topic: /left/image (sensor_msgs/msg/Image), /right/image" in str(error.value)
     assert "colored" not in str(error.value)
-    with pytest.raises(RecordingError, match=r"--depth-topic: /left/depth .*, /right/depth"):
-        open_recording(tmp_path / "bag", "/right/image")
-    chosen = open_recording(tmp_path / "bag", "/right/image", depth_topic="/right/depth").topics
-    assert chosen.image == "/right/image"
-    assert chosen.camera_info == "/right/camera_info"
+    chosen = open_recording(tmp_path / "bag", "/right/image").topics  # the rest is beside it
+    assert chosen == Topics("/right/image", "/right/camera_info", "/right/depth")
+    assert image_topics(tmp_path / "bag") == ["/left/image", "/right/image"]
     frame = read(tmp_path / "bag", image_topic="/left/image/compressed", depth_topic="none")[0]
     assert frame.depth is None and frame.frame_id == "left"
     assert frame.source.kind == COMPRESSED_IMAGE
+
+
+def test_depths_of_no_camera_in_particular_are_listed(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        writer.write_image("/camera/color/image", picture(0), 1, "camera")
+        for name in ("depth", "aligned_depth"):
+            writer.write_depth(f"/camera/{name}/image", truth(0), 1, "camera", "16UC1")
+    with pytest.raises(RecordingError, match=r"--depth-topic: /camera/aligned_.*, /camera/depth"):
+        open_recording(tmp_path / "bag")
 
 
 def test_a_wrong_topic_is_named_with_what_there_is(tmp_path: Path) -> None:
@@ -285,7 +293,7 @@ def test_an_mcap_by_another_writer_without_ros_profile_is_read(tmp_path: Path) -
         ("empty.db3", b"", "is empty"),
         ("text.mcap", b"no recording at all", "is not a readable recording"),
         ("text.db3", b"no recording at all", "is not a readable recording"),
-        ("notes.txt", b"hello", "expected a rosbag2 folder, an .mcap or .db3 file"),
+        ("notes.txt", b"hello", "expected a rosbag2 folder, an .mcap, .db3 or .bag file"),
     ],
 )
 def test_what_is_no_recording_is_refused(

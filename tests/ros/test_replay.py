@@ -8,14 +8,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from tiny_model import load_tiny
 
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_ros.messages import cloud_points, decode_depth
-from dyfn_ros.recording_writer import TYPES, RecordingWriter, RgbdFrame, write_rgbd_recording
+from dyfn_ros.recording_writer import IMAGE, TYPES, RecordingWriter, RgbdFrame, write_rgbd_recording
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
+from dyfn_ros.threads import THREADS
 
 SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
@@ -40,7 +42,8 @@ def recording(tmp_path: Path) -> Path:
 
 
 def run(recording: Path, out: Path, *options: str) -> int:
-    return main([str(recording), "--out", str(out), "--model", "tiny", *options], load_tiny)
+    fixed = ["--out", str(out), "--model", "tiny", "--threads", "1"]
+    return main([str(recording), *fixed, *options], load_tiny)
 
 
 def metrics(out: Path) -> dict[str, Any]:
@@ -239,6 +242,70 @@ def test_what_cannot_be_used_is_named(
 ) -> None:
     assert run(recording, tmp_path / "out", *options) == UNUSABLE
     assert message in capsys.readouterr().err
+
+
+def two_cameras(path: Path, broken: bool = False) -> None:
+    with RecordingWriter(path) as writer:
+        for index, frame in enumerate(rgbd(3)):
+            stamp = 1_000_000_000 + index
+            writer.write_image("/left/image", frame.image, stamp, "left")
+            writer.write_image("/right/image", frame.image[:, ::-1], stamp, "right")
+            writer.write_camera_info("/right/camera_info", CAMERA, SIZE, stamp, "right")
+            writer.write_depth("/right/depth", frame.depth_m[:, ::-1], stamp, "right")  # type: ignore[index]
+            if broken:
+                writer.write_cdr("/rear/image", IMAGE, b"\0\1\0\0abc", stamp)
+
+
+def test_every_image_topic_is_a_stream_with_a_folder(tmp_path: Path) -> None:
+    two_cameras(tmp_path / "walk")
+    assert run(tmp_path / "walk", tmp_path / "out") == UNUSABLE  # which of them?
+    assert run(tmp_path / "walk", tmp_path / "out", "--all-topics") == ALL
+    left, right = (metrics(tmp_path / "out" / f"{side}_image") for side in ("left", "right"))
+    assert left["recording"]["topics"] == {
+        "image": "/left/image",
+        "camera_info": "/right/camera_info",
+        "depth": "/right/depth",
+        "depth_info": None,
+    }
+    assert right["recording"]["topics"]["camera_info"] == "/right/camera_info"
+    assert right["frames"] == left["frames"] == 3
+    run(tmp_path / "walk", tmp_path / "alone", "--image-topic", "/right/image")
+    assert metrics(tmp_path / "alone")["output_sha256"] == right["output_sha256"]
+    assert left["output_sha256"] != right["output_sha256"]
+
+
+def test_of_several_topics_one_that_fails_does_not_stop_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    two_cameras(tmp_path / "walk", broken=True)
+    several = [part for name in ("rear", "right") for part in ("--image-topic", f"/{name}/image")]
+    assert run(tmp_path / "walk", tmp_path / "out", *several) == PARTIAL
+    assert "no frame could be used" in capsys.readouterr().err
+    assert metrics(tmp_path / "out" / "right_image")["frames"] == 3
+    assert not (tmp_path / "out" / "rear_image" / "metrics.json").exists()
+
+
+def test_a_result_says_on_how_many_threads(recording: Path, tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    main([str(recording), "--out", str(tmp_path / "out"), "--model", "tiny"], load_tiny)
+    assert metrics(tmp_path / "out")["options"]["threads"] == THREADS
+    assert torch.get_num_threads() == before
+    torch.set_num_threads(3)
+    main([str(recording), "--out", str(tmp_path / "other"), "--model", "tiny"], load_tiny)
+    torch.set_num_threads(before)
+    for name in ("options", "output_sha256"):
+        assert metrics(tmp_path / "out")[name] == metrics(tmp_path / "other")[name]
+
+
+def test_the_bundled_model_gives_the_same_bytes_whatever_the_machine_has(tmp_path: Path) -> None:
+    write_rgbd_recording(tmp_path / "walk", rgbd(2, truth=False))
+    hashes = set()
+    for threads in (1, 3):
+        torch.set_num_threads(threads)  # as OMP_NUM_THREADS or the number of cores would
+        options = ["--num-tokens", "24", "--no-output-recording"]
+        assert main([str(tmp_path / "walk"), "--out", str(tmp_path / "out"), *options]) == ALL
+        hashes.add(metrics(tmp_path / "out")["output_sha256"])
+    assert len(hashes) == 1
 
 
 def test_no_recording_is_exit_code_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,172 @@
+"""What a storage gives: messages as they were recorded; and the limits of what is believed."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import lz4.frame
+import zstandard
+from mcap.exceptions import McapError
+from rosbags.rosbag1 import ReaderError as Bag1Error
+from rosbags.serde import SerdeError
+
+from dyfn_ros.recording_writer import TYPES, RecordingError
+
+# What the readers are known to raise on bytes that are no longer what was written.
+DAMAGE = (
+    Bag1Error,
+    SerdeError,
+    McapError,
+    zstandard.ZstdError,
+    zlib.error,
+    sqlite3.Error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RuntimeError,
+    AssertionError,
+    ArithmeticError,
+    MemoryError,
+)
+MAX_BYTES = 1 << 28  # of one chunk or message; what claims to be larger is taken for damage
+MOST_LOSSES = 20  # sentences
+_PIECE = 1 << 20
+_STEP = 1 << 10  # of zstd, which makes at most 32 MiB of this
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+class Recorded(NamedTuple):
+    """One message: log_ns is when it was recorded, data is its CDR bytes."""
+
+    topic: str
+    kind: str
+    log_ns: int
+    data: bytes
+
+    def message(self) -> Any:
+        """The deserialised message. Raises RecordingError when the bytes are not its type."""
+        try:
+            return TYPES.deserialize_cdr(self.data, self.kind)
+        except DAMAGE as error:
+            raise RecordingError(f"{self.topic}: cannot read as {self.kind}: {error!r}") from error
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a recording: message type and how many messages can be read."""
+
+    kind: str
+    count: int
+
+
+class Storage(Protocol):
+    """An opened recording.
+
+    topics: name -> Topic.
+    """
+
+    topics: dict[str, Topic]
+
+    @property
+    def losses(self) -> list[str]:
+        """What could not be read, one sentence each; complete after messages() is exhausted."""
+
+    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
+        """Messages of these topics in log-time order; equal times in the order of recording."""
+
+
+class Losses:
+    """Sentences about what is lost; of very many, the first and how many more."""
+
+    def __init__(self) -> None:
+        self._sentences: list[str] = []
+        self._more = 0
+
+    def add(self, sentence: str) -> None:
+        """One more."""
+        if len(self._sentences) < MOST_LOSSES:
+            self._sentences.append(sentence)
+        else:
+            self._more += 1
+
+    @property
+    def sentences(self) -> list[str]:
+        """All of them."""
+        return [*self._sentences, *([f"and {self._more} more"] if self._more else [])]
+
+
+def count_topics(found: Iterable[Recorded]) -> dict[str, Topic]:
+    """Topics by what was read; of a topic with two types, the first counts."""
+    kinds: dict[str, str] = {}
+    counts: Counter[str] = Counter()
+    for recorded in found:
+        if kinds.setdefault(recorded.topic, recorded.kind) == recorded.kind:
+            counts[recorded.topic] += 1
+    return {topic: Topic(kind, counts[topic]) for topic, kind in kinds.items()}
+
+
+def reason(error: BaseException) -> str:
+    """An exception as part of a sentence."""
+    return f"{type(error).__name__} {error}".strip()
+
+
+def plain(data: bytes) -> bytes:
+    """A message's bytes, decompressed when they are zstd (rosbag2's compression by message)."""
+    return decompress("zstd", data) if data.startswith(_ZSTD_MAGIC) else data
+
+
+def decompress(compression: str, data: bytes, *, whole: bool = True) -> bytes:
+    """Decompress "zstd", "lz4" or "" in small steps: no length in the data is believed.
+
+    whole: raise when the data ends early; else what there is is returned.
+    Raises one of DAMAGE; ValueError when more than MAX_BYTES come out.
+    """
+    if compression == "":
+        return data
+    if compression == "zstd":
+        decoder: Any = zstandard.ZstdDecompressor().decompressobj()
+    elif compression == "lz4":
+        decoder = lz4.frame.LZ4FrameDecompressor()
+    else:
+        raise ValueError(f"compression {compression!r} is unknown, expected zstd or lz4")
+    pieces, size = [], 0
+    view = memoryview(data)
+    try:
+        for piece in _steps(decoder, compression, view):
+            pieces.append(piece)
+            size += len(piece)
+            if size > MAX_BYTES:
+                raise OverflowError(f"more than {MAX_BYTES} bytes come out of {len(data)}")
+        if not decoder.eof:
+            raise EOFError("the compressed data ends early")
+    except OverflowError:
+        raise
+    except DAMAGE:
+        if whole:
+            raise
+    return b"".join(pieces)
+
+
+def _steps(decoder: Any, compression: str, view: memoryview) -> Iterator[bytes]:
+    if compression == "lz4":
+        piece = decoder.decompress(view, max_length=_PIECE)
+        while piece or not decoder.needs_input:
+            yield piece
+            if decoder.eof:
+                return
+            piece = decoder.decompress(b"", max_length=_PIECE)
+        return
+    for start in range(0, len(view), _STEP):
+        if decoder.eof:
+            return
+        yield decoder.decompress(view[start : start + _STEP])

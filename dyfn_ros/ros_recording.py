@@ -1,0 +1,176 @@
+"""Frames out of the messages of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dyfn_ros.calibration import CalibrationRules, Calibrator, View
+from dyfn_ros.compressed_image import decode_compressed
+from dyfn_ros.depth_matching import Stamped, match_depth
+from dyfn_ros.encodings import MessageError
+from dyfn_ros.ground_truth import GroundTruth
+from dyfn_ros.messages import decode_image
+from dyfn_ros.metric_messages import Transform
+from dyfn_ros.recorded import Recorded, Storage
+from dyfn_ros.recorded_frames import Notes, RecordedFrame
+from dyfn_ros.recording_writer import COMPRESSED_IMAGE, RecordingError
+from dyfn_ros.topics import Topics
+
+
+class RosRecording:
+    """Frames of a recording of ROS messages."""
+
+    def __init__(
+        self,
+        path: Path,
+        storage: Storage,
+        topics: Topics,
+        tolerance: float,
+        transform: Transform | None = None,
+        stamps: Literal["header", "log"] = "header",
+    ) -> None:
+        self.path = path
+        self.topics = topics
+        self.notes = Notes()
+        self._rules = CalibrationRules()
+        self._storage = storage
+        self._tolerance_ns = round(tolerance * 1e9)
+        self._truth = GroundTruth(transform, self._assumed)
+        self._log_time = stamps == "log"
+
+    @property
+    def expected_frames(self) -> int:
+        """See Recording."""
+        return self._storage.topics[self.topics.image].count
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """See Recording."""
+        self.notes = Notes()
+        infos = _Infos(self._first(self.topics.camera_info), self._unusable)
+        depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
+        calibrator = Calibrator(self._unusable)
+        index, last = 0, -1
+        for image, depth in self._pairs():
+            infos.recorded = image.info or infos.recorded
+            if depth is not None:
+                depth_infos.recorded = depth.info or depth_infos.recorded
+            frame = self._decode(index, image, depth, infos, depth_infos, calibrator)
+            if frame is not None:
+                self._check_stamp(frame.stamp_ns, last)
+                index, last = index + 1, frame.stamp_ns
+                yield frame
+        self.notes.losses.update(self._storage.losses)
+
+    def _check_stamp(self, stamp_ns: int, last: int) -> None:
+        if stamp_ns <= last and not self._log_time:
+            warning = "stamps do not rise (--stamps log takes the time of recording)"
+            self.notes.warnings[f"{self.topics.image}: {warning}"] += 1
+
+    def _pairs(self) -> Iterator[tuple[Stamped, Stamped | None]]:
+        if self.topics.depth is None:
+            return ((image, None) for image in self._events())
+        return match_depth(self._events(), self.topics.depth, self._tolerance_ns)
+
+    def _first(self, topic: str | None) -> Recorded | None:
+        return next(iter(self._storage.messages([topic] if topic else [])), None)
+
+    def _events(self) -> Iterator[Stamped]:
+        """Images and depths, each with the CameraInfo of its time, in log-time order."""
+        topics = self.topics
+        sources = {topics.image: topics.camera_info, topics.depth: topics.depth_info}
+        infos: dict[str, Recorded] = {}
+        wanted = {topic for pair in sources.items() for topic in pair if topic}
+        for recorded in self._storage.messages(wanted):
+            if recorded.topic not in sources:
+                infos[recorded.topic] = recorded
+                continue
+            stamped = self._stamped(recorded)
+            if stamped is not None:
+                yield replace(stamped, info=infos.get(sources[recorded.topic] or ""))
+
+    def _stamped(self, recorded: Recorded) -> Stamped | None:
+        try:
+            stamp = recorded.message().header.stamp
+        except RecordingError as error:
+            self.notes.losses[str(error)] += 1
+            return None
+        if self._log_time:
+            return Stamped(recorded.log_ns, recorded)
+        return Stamped(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded)
+
+    def _unusable(self, reason: str) -> None:
+        """Noted once, however many frames it is in force for."""
+        self.notes.warnings[f"{self.topics.camera_info}: {reason}"] = 1
+
+    def _assumed(self, reason: str) -> None:
+        self.notes.warnings[f"{self.topics.depth}: {reason}"] = 1
+
+    def _decode(
+        self,
+        index: int,
+        image: Stamped,
+        depth: Stamped | None,
+        infos: _Infos,
+        depth_infos: _Infos,
+        calibrator: Calibrator,
+    ) -> RecordedFrame | None:
+        message = image.recorded.message()
+        frame_id = str(message.header.frame_id)
+        compressed = image.recorded.kind == COMPRESSED_IMAGE
+        try:
+            pixels = decode_compressed(message) if compressed else decode_image(message)
+            view = calibrator.view(pixels, frame_id, infos.message(), self._rules)
+        except MessageError as error:
+            self.notes.losses[f"{image.recorded.topic}: image skipped: {error}"] += 1
+            return None
+        return RecordedFrame(
+            index=index,
+            stamp_ns=image.stamp_ns,
+            frame_id=frame_id,
+            image=view.image,
+            camera_matrix=view.matrix,
+            depth=self._decode_depth(depth, depth_infos.message(), view, frame_id),
+            source=image.recorded,
+            info=infos.recorded,
+            visible=view.visible,
+        )
+
+    def _decode_depth(
+        self, depth: Stamped | None, info: Any, view: View, frame_id: str
+    ) -> np.ndarray | None:
+        if depth is None:
+            if self.topics.depth is not None:
+                self.notes.warnings[f"{self.topics.depth}: no depth at an image's stamp"] += 1
+            return None
+        try:
+            return self._truth.decode(depth.recorded, info, view, frame_id)
+        except MessageError as error:
+            self.notes.losses[f"{depth.recorded.topic}: depth skipped: {error}"] += 1
+            return None
+
+
+class _Infos:
+    """The CameraInfo in force, deserialised once per content."""
+
+    def __init__(self, first: Recorded | None, warn: Callable[[str], None]) -> None:
+        self.recorded = first
+        self._warn = warn
+        self._known: tuple[bytes, Any] | None = None
+
+    def message(self) -> Any:
+        """None without one, or with one that cannot be read."""
+        if self.recorded is None:
+            return None
+        content = self.recorded.data[12:]  # all but the CDR head and the stamp
+        if self._known is None or self._known[0] != content:
+            try:
+                self._known = (content, self.recorded.message())
+            except RecordingError as error:
+                self._warn(str(error))
+                self._known = (content, None)
+        return self._known[1]
