@@ -104,7 +104,7 @@ def ransac_procrustes(
     with_scale: bool = False,
     seed: int = 0,
     max_hypotheses: int = 1024,
-    min_inliers: int = 24,
+    min_inliers: int = 16,
     min_share: float = 0.2,
     flat: float = 0.01,
 ) -> Consensus:
