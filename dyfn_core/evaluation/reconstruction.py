@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dyfn_core.evaluation.matching import MatchWindow, partners, sample_at
-from dyfn_core.evaluation.voxel_cloud import VoxelCloud
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.geometry.registration import (
     Consensus,
@@ -17,6 +16,7 @@ from dyfn_core.geometry.registration import (
     procrustes,
     ransac_procrustes,
 )
+from dyfn_core.geometry.voxel_grid import VoxelGrid
 
 OFFSETS = (1, 5, 21)  # the paper's partners of frame j: j-1, j-5, j-21
 EDGE_SHARE = 0.1  # a step in depth that pixels hang in; they are neither matched nor fused
@@ -83,7 +83,7 @@ class Reconstruction:
 
     options: ReconstructionOptions = field(default_factory=ReconstructionOptions)
     frames: list[FramePose] = field(default_factory=list)
-    cloud: VoxelCloud | None = None
+    cloud: VoxelGrid | None = None
     _kept: deque[_Kept] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -134,7 +134,7 @@ class Reconstruction:
         if not depth.size:
             return FramePose(None, problem="no valid point")
         size = self.options.voxel * float(np.median(depth))
-        self.cloud = VoxelCloud(size, self.options.max_voxels)
+        self.cloud = VoxelGrid(size, self.options.max_voxels)
         return FramePose(Similarity.identity())
 
     def _pose(self, points: np.ndarray, window: MatchWindow) -> FramePose:
@@ -155,9 +155,7 @@ class Reconstruction:
             earlier = self._kept[-offset].pose
             assert earlier is not None
             candidates.append(earlier.after(consensus.transform))
-            pairs.append(
-                (source[consensus.inliers], earlier.apply(target[consensus.inliers]))
-            )
+            pairs.append((source[consensus.inliers], earlier.apply(target[consensus.inliers])))
             agreed.append(offset)
         if not candidates:
             return FramePose(None, total, problem=problems[0])

@@ -54,12 +54,15 @@ class Picture:
     photographic: bool = True
 
 
+Part = Text | Table | Picture
+
+
 @dataclass(frozen=True)
 class Section:
     """A heading and what is under it."""
 
     title: str
-    parts: Sequence[Text | Table | Picture]
+    parts: Sequence[Part]
 
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> None:
@@ -82,7 +85,7 @@ def _section(section: Section) -> str:
     return f"<h2>{escape(section.title)}</h2>\n{parts}"
 
 
-def _part(part: Text | Table | Picture) -> str:
+def _part(part: Part) -> str:
     if isinstance(part, Text):
         style = ' class="note"' if part.note else ""
         return f"<p{style}>{escape(part.text)}</p>"
