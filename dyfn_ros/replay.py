@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,13 +20,9 @@ import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.report import Picture, Section, Table, Text, text_table, write_report
-from dyfn_core.evaluation.sequence import (
-    COLUMNS,
-    SequenceEvaluation,
-    curve_picture,
-    score_table,
-)
+from dyfn_core.evaluation.report import Section, Table, text_table, write_report
+from dyfn_core.evaluation.sequence import COLUMNS, SequenceEvaluation, score_table
+from dyfn_core.evaluation.sequence_report import sequence_sections
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
 from dyfn_ros.replay_recording import ReplayRecording
@@ -59,6 +55,7 @@ class Options:
     tolerance: float = 0.02
     scene_cut_threshold: float = 0.0
     output_recording: bool = True
+    compare: bool = False
 
 
 def parse(arguments: Sequence[str] | None = None) -> Options:
@@ -77,6 +74,7 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     add("--camera-info-topic", help='its CameraInfo; "none" for an unknown camera')
     add("--depth-topic", help='ground truth (16UC1 mm or 32FC1 m); "none" for no scores')
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
+    add("--compare", action="store_true", help="also run the base model, for one report on both")
     add("--max-frames", type=_positive, help="stop after so many frames")
     add("--stride", type=_positive, default=1, help="take every N-th frame")
     add("--num-tokens", type=_positive, help="resolution inside the model")
@@ -137,7 +135,23 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     if evaluation.frames == 0:
         reasons = "; ".join(recording.notes.losses) or "it holds no frames"
         raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
-    return _write_results(options, recording, model, evaluation)
+    base = _run_base(options, model) if options.compare else None
+    return _write_results(options, recording, model, evaluation, base)
+
+
+def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | None:
+    """The same frames without DyFN, nothing but their evaluation kept; None without DyFN."""
+    if not options.stabilizer or model.stabilizer is None:
+        return None
+    alone = replace(options, stabilizer=False, output_recording=False)
+    recording = open_recording(
+        options.recording,
+        options.image_topic,
+        options.camera_info_topic,
+        options.depth_topic,
+        options.tolerance,
+    )
+    return _run(alone, recording, model)
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -194,7 +208,11 @@ def _run(options: Options, recording: Recording, model: GeometryModel) -> Sequen
 
 
 def _write_results(
-    options: Options, recording: Recording, model: GeometryModel, evaluation: SequenceEvaluation
+    options: Options,
+    recording: Recording,
+    model: GeometryModel,
+    evaluation: SequenceEvaluation,
+    base: SequenceEvaluation | None,
 ) -> dict[str, Any]:
     results = evaluation.results()
     metrics = {
@@ -203,6 +221,7 @@ def _write_results(
         "stabilizer": options.stabilizer and model.stabilizer is not None,
         "quantity": model.quantity,
         **results,
+        **({} if base is None else {"base": base.results()}),
         "recording": {
             "path": str(options.recording),
             "topics": vars(recording.topics),
@@ -220,7 +239,7 @@ def _write_results(
     strip = evaluation.draw_strip()
     (options.out / "strip.png").write_bytes(encode_picture(strip))
     _write_rows(options.out / "frames.csv", evaluation)
-    _write_report(options, metrics, evaluation, Picture(strip, "input, truth, depth, error"))
+    _write_report(options, metrics, evaluation, base)
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
     partial = options.out / "metrics.json.partial"
     partial.write_text(text, encoding="utf-8")
@@ -236,45 +255,44 @@ def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
 
 
 def _write_report(
-    options: Options, metrics: dict[str, Any], evaluation: SequenceEvaluation, strip: Picture
+    options: Options,
+    metrics: dict[str, Any],
+    evaluation: SequenceEvaluation,
+    base: SequenceEvaluation | None,
 ) -> None:
-    name = run_name(metrics)
     facts: list[list[str | float | int | None]] = [
         ["recording", str(options.recording)],
         ["frames", metrics["frames"]],
         ["model", options.model],
         ["DyFN", "on" if metrics["stabilizer"] else "off"],
         ["valid share of the pixels with truth", metrics["coverage"]],
-        ["latency p99, ms", metrics["latency_ms"]["p99"]],
         ["output SHA-256", metrics["output_sha256"][:16]],
         *([topic, value] for topic, value in metrics["recording"]["topics"].items()),
+        *([name, value] for name, value in metrics["options"].items() if value is not None),
     ]
     notes = metrics["recording"]["losses"] | metrics["recording"]["warnings"]
-    sections = [
-        Section("Scores", [score_table({name: metrics}), Text(SCORE_NOTE, note=True)]),
-        Section("Frames", [strip]),
-    ]
-    if metrics["image"] is not None:
-        curves = Picture(curve_picture({name: evaluation}), "scale and error", photographic=False)
-        sections.append(Section("Over time", [curves]))
+    runs = {run_name(metrics): evaluation}
+    if base is not None:
+        runs[run_name({**metrics, "stabilizer": False})] = base
+    sections = sequence_sections(runs)
     if notes:
         rows = [[text, count] for text, count in notes.items()]
-        sections.append(Section("Losses and warnings", [Table(("", "times"), rows)]))
+        sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))
     sections.append(Section("What was run", [Table(("", ""), facts)]))
     write_report(options.out / "report.html", f"Replay of {options.recording.name}", sections)
-
-
-SCORE_NOTE = (
-    "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
-    "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
-    "shift for the whole sequence. Scale spread: standard deviation of the log of each frame's "
-    "own scale. The controls know nothing of the image: a vertical ramp and a constant."
-)
 
 
 def run_name(metrics: dict[str, Any]) -> str:
     """How a run is called in tables."""
     return f"{metrics['model']}{' with DyFN' if metrics['stabilizer'] else ', base model'}"
+
+
+def _by_name(metrics: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What was run -> its results."""
+    found = {run_name(metrics): metrics}
+    if "base" in metrics:
+        found[run_name({**metrics, "stabilizer": False})] = metrics["base"]
+    return found
 
 
 def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> int:
@@ -297,7 +315,7 @@ def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> 
                 f"dyfn-replay: {kind[:-1].replace('losse', 'loss')}: {text}{times}", file=sys.stderr
             )
     print(f"{metrics['frames']} frames of {options.recording}")
-    print(text_table(score_table({run_name(metrics): metrics})))
+    print(text_table(score_table(_by_name(metrics))))
     print(f"results in {options.out} (report.html, metrics.json, frames.csv, output.mcap)")
     return PARTIAL if notes["losses"] else ALL
 

@@ -11,7 +11,7 @@ from dyfn_core.data.pool import DataSpec, open_pool, resolve
 
 
 def add_data_arguments(parser: argparse.ArgumentParser) -> None:
-    """DATA, --sequence, --split, --start, --stride, --max-frames, --model, --num-tokens, --device."""
+    """Which data and frames, which model, and where the results go."""
     add = parser.add_argument
     add("data", metavar="[KIND=]PATH", help="RGB-D folder, recording or data set with depth")
     add("--sequence", help="name (or its end) of one sequence; default: the first")

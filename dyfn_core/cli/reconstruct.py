@@ -110,17 +110,19 @@ def _write(
 ) -> None:
     out: Path = options.out
     said = {key: value for key, value in vars(options).items() if key not in ("run", "command")}
+    shown = {key: str(v) if isinstance(v, Path) else v for key, v in said.items()}
+    runs = {name: result.values() for name, result in results.items()}
     summary = {
         "sequence": sequence,
-        "options": {k: str(v) if isinstance(v, Path) else v for k, v in said.items()},
-        "runs": {name: result.values() for name, result in results.items()},
+        "options": shown,
+        "runs": runs,
         "losses": dict(found.losses),
     }
     pictures: list[Section] = []
     for name in found.runs:
         stem = name.replace(" ", "_").lower()
         points, colours, metric = aligned_cloud(found, name)
-        summary["runs"][name]["ply_in_metres"] = metric
+        runs[name]["ply_in_metres"] = metric
         picture = draw_run(found, name)
         (out / f"cloud_{stem}.png").write_bytes(encode_picture(picture))
         if len(points):
@@ -132,7 +134,7 @@ def _write(
     text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
     (out / "reconstruction.json").write_text(text, encoding="utf-8")
     scores = Section("Scores", [reconstruction_table(results), Text(TABLE_NOTE, note=True)])
-    facts = Table(("", ""), [[key, _shown(value)] for key, value in summary["options"].items()])
+    facts = Table(("", ""), [[key, _shown(value)] for key, value in shown.items()])
     title = f"Reconstruction of {Path(sequence).name}"
     write_report(out / "report.html", title, [scores, *pictures, Section("What was run", [facts])])
 

@@ -53,7 +53,7 @@ class FlowMatcher:
         """See Matcher. Raises ValueError for images of differing sizes."""
         if first.shape != second.shape:
             raise ValueError(f"flow needs images of one size, got {first.shape}, {second.shape}")
-        flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        flow = _opencv("DISOpticalFlow_create")(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         forward = flow.calc(first, second, None)
         backward = flow.calc(second, first, None)
         height, width = first.shape
@@ -131,20 +131,22 @@ class JoinedMatcher:
         )
 
 
-def _akaze() -> Callable[[], Any]:
-    """OpenCV 5 has it in its contrib modules only."""
+def _opencv(name: str) -> Callable[..., Any]:
+    """A maker that not every build of OpenCV has: version 5 has AKAZE in contrib alone."""
     for module in (cv2, getattr(cv2, "xfeatures2d", None)):
-        make: Callable[[], Any] | None = getattr(module, "AKAZE_create", None)
+        make: Callable[..., Any] | None = getattr(module, name, None)
         if make is not None:
             return make
-    raise ValueError("matcher 'akaze' is not in this build of OpenCV; 'sift' is much like it")
+    raise ValueError(
+        f"this build of OpenCV ({cv2.__version__}) has no {name}: take another matcher"
+    )
 
 
 MATCHERS: dict[str, Callable[[], Matcher]] = {
     "dis": FlowMatcher,
-    "sift": lambda: FeatureMatcher(lambda: cv2.SIFT_create(FEATURES), cv2.NORM_L2),
-    "akaze": lambda: FeatureMatcher(_akaze(), cv2.NORM_HAMMING),
-    "orb": lambda: FeatureMatcher(lambda: cv2.ORB_create(FEATURES), cv2.NORM_HAMMING),
+    "sift": lambda: FeatureMatcher(lambda: _opencv("SIFT_create")(FEATURES), cv2.NORM_L2),
+    "akaze": lambda: FeatureMatcher(_opencv("AKAZE_create"), cv2.NORM_HAMMING),
+    "orb": lambda: FeatureMatcher(lambda: _opencv("ORB_create")(FEATURES), cv2.NORM_HAMMING),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def trajectory_error(
     distances = np.linalg.norm(fit.apply(centres) - truth, axis=1)
     steps = [
         _step_error(a[1], b[1], a[2], b[2], fit.scale)
-        for a, b in zip(both, both[1:], strict=False)
+        for a, b in pairwise(both)
         if b[0] == a[0] + 1
     ]
     metres, degrees = np.array(steps).reshape(-1, 2).T if steps else (np.full(1, np.nan),) * 2

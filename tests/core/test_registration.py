@@ -1,4 +1,4 @@
-"""Registration of 3D-3D pairs: exact without noise, robust with outliers, honest when degenerate."""
+"""Registration of 3D-3D pairs: exact without noise, bears outliers, names the degenerate."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def motion(rng: np.random.Generator, scale: float = 1.0) -> Similarity:
 def test_procrustes_recovers_the_motion_exactly(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     true = motion(rng, scale)
-    points = rng.normal(size=(50, 3)) + [0, 0, 5]
+    points = rng.normal((0, 0, 5), size=(50, 3))
     found = procrustes(points, true.apply(points), with_scale=True)
     np.testing.assert_allclose(found.matrix, true.matrix, rtol=0, atol=1e-9)
     rigid = procrustes(points, motion(rng).apply(points))
