@@ -10,8 +10,6 @@ import numpy as np
 
 from dyfn_core.geometry.registration import RegistrationError, Similarity, procrustes
 
-LINE = 1e-3  # a path whose second extent is below this share of its first is straight
-
 
 @dataclass(frozen=True)
 class TrajectoryError:
@@ -19,15 +17,15 @@ class TrajectoryError:
 
     ate: root mean square distance of the camera centres after one similarity, metres. rpe_metres,
     rpe_degrees: root mean square of the error of the motion between neighbouring frames, the
-    estimate scaled by that similarity. frames: compared. alignment: estimate -> truth; None when
-    the path is straight or stands still, which leaves rotations about it open (ate stays defined).
+    estimate scaled by that similarity. frames: compared. alignment: estimate -> truth, for clouds:
+    turned by the cameras' orientations, because their centres fix no turn about a straight path.
     """
 
     ate: float
     rpe_metres: float
     rpe_degrees: float
     frames: int
-    alignment: Similarity | None
+    alignment: Similarity
 
 
 def trajectory_error(
@@ -63,7 +61,7 @@ def trajectory_error(
         _rms(metres),
         _rms(degrees),
         len(both),
-        None if _straight(centres) or _straight(truth) else fit,
+        _oriented([pose for _, pose, _ in both], np.array([true for _, _, true in both])),
     )
 
 
@@ -80,9 +78,17 @@ def _step_error(
     return float(np.linalg.norm(moved - truth[:3, 3])), float(angle)
 
 
-def _straight(centres: np.ndarray) -> bool:
-    extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-    return bool(extent[1] <= LINE * extent[0])
+def _oriented(poses: Sequence[Similarity], truth: np.ndarray) -> Similarity:
+    """The mean turn of the orientations, then least squares over the centres."""
+    turns = [true[:3, :3] @ pose.rotation.T for pose, true in zip(poses, truth, strict=True)]
+    u, _, vt = np.linalg.svd(np.sum(turns, axis=0))
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    centres = np.array([pose.translation for pose in poses]) @ rotation.T
+    target = truth[:, :3, 3]
+    a, b = centres - centres.mean(0), target - target.mean(0)
+    # A scale that is not positive would turn the cloud inside out.
+    scale = max(float((a * b).sum() / (a**2).sum()), np.finfo(float).eps)
+    return Similarity(rotation, target.mean(0) - scale * centres.mean(0), scale)
 
 
 def _rms(values: np.ndarray) -> float:

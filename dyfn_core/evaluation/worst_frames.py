@@ -11,7 +11,7 @@ from dyfn_core.evaluation.pictures import FrameStrip, Snapshot, snapshot
 from dyfn_core.evaluation.protocols import FrameScore
 from dyfn_core.prediction import DEPTH, DISPARITY
 
-STRETCHES = 60  # a recording is cut into so many; of each at most one frame is called worst
+STRETCHES = 24  # a recording is cut into so many; of each at most one frame is called worst
 KEPT = 10  # stretches a reason
 WIDTH = 200
 
@@ -32,7 +32,7 @@ class WorstFrames:
 
     def __init__(self, expected_frames: int, quantity: str = DEPTH) -> None:
         self.quantity = quantity
-        self.stretch = max(1, expected_frames // STRETCHES)
+        self.stretch = max(1, -(-expected_frames // STRETCHES))
         self._kept: tuple[dict[int, _Candidate], ...] = ({}, {}, {})
 
     def add(
