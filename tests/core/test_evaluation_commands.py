@@ -17,7 +17,7 @@ from dyfn_core.cli import reconstruct, study
 from dyfn_core.evaluation.empirical_study import statistics_grid
 from dyfn_core.models.base import Latent
 
-FRAMES = 6
+FRAMES = 12
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_reconstruct_writes_table_clouds_and_report(
     exact = found["runs"]["true depth"]
     assert (exact["frames"], exact["posed"], exact["ply_in_metres"]) == (FRAMES, FRAMES, True)
     assert exact["trajectory"]["ate"] < 0.02 and exact["cloud"]["chamfer"] < 0.05
-    assert "true depth" in printed and "6 of 6" in printed
+    assert "true depth" in printed and "12 of 12" in printed
     for name in ("cloud_true_depth.ply", "cloud_true_depth.png", "cloud_base_model.png"):
         assert (tmp_path / name).stat().st_size > 1000
     page = (tmp_path / "report.html").read_text()
@@ -77,7 +77,7 @@ def test_wrong_arguments_are_named(
     out = ["--out", str(tmp_path / "out")]
     for wrong, told in (
         (["--matcher", "x"], "'x' is unknown"),
-        (["--start", "99"], "--start 99 is behind the last of 6 frames"),
+        (["--start", "99"], "--start 99 is behind the last of 12 frames"),
         (["--stride", "0"], "--stride must be at least 1"),
         (["--sequence", "kitchen"], "no sequence 'kitchen'; there are"),
         (["--offsets", "0"], "offsets must be frames back"),
