@@ -72,7 +72,8 @@ document.querySelectorAll("figure[data-curve]").forEach(function (figure) {
     tip.style.display = "block";
     var left = place / box.width * area.width + 12;
     if (left + tip.offsetWidth > area.width) left -= tip.offsetWidth + 24;
-    tip.style.left = left + "px"; tip.style.top = (area.top - figure.getBoundingClientRect().top + 8) + "px";
+    tip.style.left = left + "px";
+    tip.style.top = (area.top - figure.getBoundingClientRect().top + 8) + "px";
   });
   svg.addEventListener("pointerleave", function () {
     tip.style.display = "none"; cursor.style.visibility = "hidden";
