@@ -18,13 +18,13 @@ import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.pictures import draw_cloud, encode_picture
-from dyfn_core.evaluation.report import Picture, Section, Text, text_table, write_report
+from dyfn_core.evaluation.report import Section, Text, text_table, write_report
 from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, score_table
+from dyfn_core.evaluation.sequence_report import sequence_sections
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.node_process import NODE_COMMAND, LiveError, NodeProcess
 from dyfn_ros.recording_writer import COMPRESSED_IMAGE
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.replay_results import SCORE_NOTE
 
 if TYPE_CHECKING:
     from dyfn_ros.live_player import LivePlayer
@@ -157,15 +157,10 @@ def _write(options: Options, recording: Recording, runs: dict[str, Run]) -> None
     out = options.out
     table = score_table(results)
     strips = {name: evaluation.draw_strip() for name, evaluation in evaluations.items()}
-    sections = [
-        Section("Scores", [table, Text(SCORE_NOTE + LATENCY_NOTE, note=True)]),
-        *(Section(f"Frames, {name}", [Picture(strips[name], name)]) for name in runs),
-        *(Section(f"Clouds, {name}", [Picture(run.clouds, name)]) for name, run in runs.items()),
-    ]
+    clouds = {name: run.clouds for name, run in runs.items()}
+    sections = sequence_sections(evaluations, clouds, LATENCY_NOTE)
     if all(result["image"] is not None for result in results.values()):
-        curves = curve_picture(evaluations)
-        (out / "curves.png").write_bytes(encode_picture(curves))
-        sections.insert(1, Section("Over time", [Picture(curves, "scale and error", False)]))
+        (out / "curves.png").write_bytes(encode_picture(curve_picture(evaluations)))
     for name, stabilize in RUNS.items():
         kind = "dyfn" if stabilize else "base"
         (out / f"strip_{kind}.png").write_bytes(encode_picture(strips[name]))

@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,8 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     model = loader(options.model, options.device)
     options.out.mkdir(parents=True, exist_ok=True)
     with computing_threads(options.threads) as threads:
-        evaluation, outputs = _run(options, recording, model)
+        outputs = _outputs_of(options, recording)
+        evaluation = _run(options, recording, model, outputs)
         if evaluation.frames == 0:
             reasons = "; ".join(recording.notes.losses) or "it holds no frames"
             raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
@@ -74,7 +76,7 @@ def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | No
     """The same frames without DyFN, nothing but their evaluation kept; None without DyFN."""
     if not options.stabilizer or model.stabilizer is None:
         return None
-    return _run(replace(options, stabilizer=False, write=()), _open(options), model)[0]
+    return _run(replace(options, stabilizer=False), _open(options), model)
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -86,13 +88,16 @@ def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFr
 
 
 def _run(
-    options: Options, recording: Recording, model: GeometryModel
-) -> tuple[SequenceEvaluation, ReplayOutputs]:
+    options: Options,
+    recording: Recording,
+    model: GeometryModel,
+    outputs: ReplayOutputs | None = None,
+) -> SequenceEvaluation:
     cuts = SceneCutHook(lambda: options.scene_cut_threshold)
     camera = CameraStream(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
-    with _outputs_of(options, recording) as outputs:
+    with outputs or nullcontext():
         for frame in tqdm(
             frames, total=expected, unit="frame", file=sys.stderr, disable=not options.progress
         ):
@@ -122,11 +127,13 @@ def _run(
                 )
             except ValueError as error:
                 raise RecordingError(f"{recording.topics.depth}: {error}") from error
-            outputs.write(frame, geometry, score)
-        video, quantity = evaluation.video(), model.quantity
-        alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
-        outputs.finish(alignment, quantity)
-    return evaluation, outputs
+            if outputs is not None:
+                outputs.write(frame, geometry, score)
+        if outputs is not None:
+            video, quantity = evaluation.video(), model.quantity
+            alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
+            outputs.finish(alignment, quantity)
+    return evaluation
 
 
 def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.evaluation.controls import ema_control, frozen_control
+from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
 from dyfn_core.experiments.report import (
     grid_table,
@@ -22,7 +23,6 @@ from dyfn_core.experiments.report import (
 )
 from dyfn_core.experiments.runner import Plan, Runner, encode_all
 from dyfn_core.experiments.scenes import Scene, predictions, scores_by_length
-from dyfn_core.experiments.statistics_grid import draw_grid, statistics_grid
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.stabilizer import Stabilizer

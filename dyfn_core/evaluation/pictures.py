@@ -67,6 +67,18 @@ class Snapshot:
     truth: np.ndarray | None
 
 
+def snapshot(
+    index: int, image: np.ndarray, depth: np.ndarray, truth: np.ndarray | None, width: int
+) -> Snapshot:
+    """Arrays as in Snapshot, of any size -> `width` pixels wide."""
+    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    depth = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+    if truth is not None:
+        truth = cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST)
+    return Snapshot(index, small, depth, truth)
+
+
 class FrameStrip:
     """Keeps a few evenly spaced frames of a sequence and draws them side by side.
 
@@ -88,15 +100,7 @@ class FrameStrip:
         """Keep the frame if it is one of the wanted ones; arrays as in Snapshot, any size."""
         if index not in self.wanted:
             return
-        height = max(1, round(image.shape[0] * self.width / image.shape[1]))
-        size = (self.width, height)
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        rest = [
-            None if a is None else cv2.resize(a, size, interpolation=cv2.INTER_NEAREST)
-            for a in (depth.astype(np.float32), truth)
-        ]
-        assert rest[0] is not None
-        self.snapshots.append(Snapshot(index, small, rest[0], rest[1]))
+        self.snapshots.append(snapshot(index, image, depth, truth, self.width))
 
     def draw(self, scale: float = 1.0, shift: float = 0.0) -> np.ndarray:
         """One row a frame: input, ground truth, depth, error (the middle and last need truth).

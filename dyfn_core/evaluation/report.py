@@ -1,9 +1,9 @@
-"""One self-contained HTML file per evaluation: tables and pictures, no script, no network."""
+"""One self-contained HTML file per evaluation: tables, curves and pictures, no network needed."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -11,22 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.evaluation.pictures import encode_picture
+from dyfn_core.evaluation.report_curves import (
+    Curves,
+    Histogram,
+    curves_html,
+    histogram_html,
+)
+from dyfn_core.evaluation.report_style import SCRIPT, STYLE
 
 Cell = str | float | int | None
-
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem;
-       color: #1c1e21; background: #fff; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
-table { border-collapse: collapse; margin: .5rem 0; }
-th, td { padding: .25rem .8rem; border-bottom: 1px solid #d8dbe0; text-align: right; }
-th:first-child, td:first-child { text-align: left; }
-img { max-width: 100%; height: auto; display: block; margin: .5rem 0; }
-p.note { color: #5a6068; font-size: .9rem; }
-@media (prefers-color-scheme: dark) {
-  body { color: #e6e8eb; background: #16181b; } th, td { border-color: #383c42; }
-  p.note { color: #a0a6ae; } }
-"""
 
 
 @dataclass(frozen=True)
@@ -55,21 +48,34 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class KeyFigures:
+    """A few numbers, large. figures: what it is -> value."""
+
+    figures: Mapping[str, Cell]
+
+
+Part = Text | Table | Picture | Curves | Histogram | KeyFigures
+
+
+@dataclass(frozen=True)
 class Section:
     """A heading and what is under it."""
 
     title: str
-    parts: Sequence[Text | Table | Picture]
+    parts: Sequence[Part]
 
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> None:
     """Write the HTML file; it appears only when it is complete."""
-    body = "\n".join(_section(section) for section in sections)
+    body = "\n".join(_section(number, section) for number, section in enumerate(sections))
+    links = "".join(f'<a href="#s{n}">{escape(s.title)}</a>' for n, s in enumerate(sections))
+    interactive = any(isinstance(part, Curves) for s in sections for part in s.parts)
+    script = f"<script>{SCRIPT}</script>\n" if interactive else ""
     page = (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
-        f"<body><h1>{escape(title)}</h1>\n{body}\n</body></html>\n"
+        f"<body><h1>{escape(title)}</h1>\n<nav>{links}</nav>\n{body}\n{script}</body></html>\n"
     )
     target = Path(path)
     partial = target.with_name(f"{target.name}.partial")
@@ -77,25 +83,40 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> N
     partial.replace(target)
 
 
-def _section(section: Section) -> str:
+def _section(number: int, section: Section) -> str:
     parts = "\n".join(_part(part) for part in section.parts)
-    return f"<h2>{escape(section.title)}</h2>\n{parts}"
+    return f'<section id="s{number}"><h2>{escape(section.title)}</h2>\n{parts}</section>'
 
 
-def _part(part: Text | Table | Picture) -> str:
+def _part(part: Part) -> str:
     if isinstance(part, Text):
         style = ' class="note"' if part.note else ""
         return f"<p{style}>{escape(part.text)}</p>"
     if isinstance(part, Table):
-        head = "".join(f"<th>{escape(name)}</th>" for name in part.header)
-        rows = "\n".join(
-            "<tr>" + "".join(f"<td>{escape(format_cell(cell))}</td>" for cell in row) + "</tr>"
-            for row in part.rows
+        return _table(part)
+    if isinstance(part, Curves):
+        return curves_html(part)
+    if isinstance(part, Histogram):
+        return histogram_html(part)
+    if isinstance(part, KeyFigures):
+        figures = "".join(
+            f"<div><b>{escape(format_cell(value))}</b><span>{escape(name)}</span></div>"
+            for name, value in part.figures.items()
         )
-        return f"<table><thead><tr>{head}</tr></thead><tbody>\n{rows}\n</tbody></table>"
+        return f'<div class="figures">{figures}</div>'
     suffix, kind = (".jpg", "jpeg") if part.photographic else (".png", "png")
     data = base64.b64encode(encode_picture(part.image, suffix)).decode("ascii")
     return f'<img alt="{escape(part.alt, quote=True)}" src="data:image/{kind};base64,{data}">'
+
+
+def _table(part: Table) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name in part.header)
+    rows = "\n".join(
+        "<tr>" + "".join(f"<td>{escape(format_cell(cell))}</td>" for cell in row) + "</tr>"
+        for row in part.rows
+    )
+    head = f"<thead><tr>{head}</tr></thead>" if any(part.header) else ""
+    return f'<div class="wide"><table>{head}<tbody>\n{rows}\n</tbody></table></div>'
 
 
 def format_cell(cell: Cell) -> str:

@@ -18,6 +18,7 @@ from dyfn_core.evaluation.protocols import (
     to_shape,
 )
 from dyfn_core.evaluation.report import Cell, Table
+from dyfn_core.evaluation.worst_frames import WorstFrames
 from dyfn_core.prediction import DEPTH
 
 COLUMNS = (
@@ -48,6 +49,7 @@ class SequenceEvaluation:
     ) -> None:
         self.scores = ControlledScorer(depth_max, quantity=quantity)
         self.strip = FrameStrip(expected_frames, quantity=quantity)
+        self.worst = WorstFrames(expected_frames, quantity)
         self._stamps: list[float] = []
         self._latencies: list[float] = []
         self._hash = hashlib.sha256()
@@ -75,9 +77,11 @@ class SequenceEvaluation:
         self._stamps.append(stamp)
         self._latencies.append(latency)
         if truth is None:
-            truth = np.full((1, 1), np.nan, np.float32)
-            masked = truth
-        return self.scores.push(to_shape(masked, truth.shape), truth)
+            nothing = np.full((1, 1), np.nan, np.float32)
+            return self.scores.push(nothing, nothing)
+        score = self.scores.push(to_shape(masked, truth.shape), truth)
+        self.worst.add(len(self._stamps) - 1, image, masked, truth, score)
+        return score
 
     @property
     def frames(self) -> int:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.evaluation.controls import VariantScore, gap_closed
+from dyfn_core.evaluation.empirical_study import StatisticsGrid, grid_ranges
+from dyfn_core.evaluation.report import format_cell
 from dyfn_core.experiments.declared import Experiment
 from dyfn_core.experiments.runner import ArmScores
 from dyfn_core.experiments.scenes import BASE_ROWS
-from dyfn_core.experiments.statistics_grid import StatisticsGrid
 
 HEADING = "## Experiments"
 METRICS = ("image_abs_rel", "video_abs_rel", "video_delta1")
@@ -106,17 +107,10 @@ def length_table(curves: Mapping[str, Mapping[int, Sequence[float]]]) -> str:
 
 
 def grid_table(grid: StatisticsGrid) -> str:
-    """The ranges over the grid, and its corners."""
-    lines = ["| over a, b | lowest | highest | a = b = 1 |", "| --- | --- | --- | --- |"]
-    centre = grid.factors.index(1.0)
-    parts = {
-        "scale": grid.scale,
-        "shift / median depth": grid.shift,
-        "AbsRel after alignment": grid.abs_rel,
-    }
-    for name, values in parts.items():
-        middle = values[centre, centre]
-        lines.append(f"| {name} | {values.min():.3f} | {values.max():.3f} | {middle:.3f} |")
+    """The ranges over the grid as Markdown."""
+    table = grid_ranges(grid)
+    lines = [f"| {' | '.join(table.header)} |", f"|{' --- |' * len(table.header)}"]
+    lines += [f"| {' | '.join(format_cell(cell) for cell in row)} |" for row in table.rows]
     return "\n".join(lines)
 
 

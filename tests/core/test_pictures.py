@@ -124,7 +124,7 @@ def test_the_report_is_one_file_that_escapes_its_text(tmp_path: Path) -> None:
     assert "a &lt; b" in page and "&lt;b&gt;" in page and "0.123" in page and "–" in page
     assert "data:image/jpeg;base64," in page and "data:image/png;base64," in page
     assert "black &quot;square&quot;" in page
-    assert 'src="http' not in page and "<script" not in page
+    assert 'src="http' not in page and "<script" not in page  # nothing to point at, no script
 
 
 def test_tables_for_the_terminal_are_aligned() -> None:

@@ -84,9 +84,23 @@ def test_it_writes_everything(recording: Path, tmp_path: Path) -> None:
     strip = cv2.imread(str(tmp_path / "out" / "strip.png"))
     assert strip.shape[1] > 4 * 200 and strip.std() > 20
     page = (tmp_path / "out" / "report.html").read_text()
-    assert page.count("data:image/") == 2
+    assert page.count("data:image/") == 2  # strip, worst frames
+    assert page.count("<svg") == 5
     assert "http" not in page
     assert "tiny with DyFN" in page
+
+
+def test_compare_runs_the_base_on_the_same_frames(recording: Path, tmp_path: Path) -> None:
+    assert run(recording, tmp_path / "both", "--compare") == ALL
+    assert run(recording, tmp_path / "base", "--no-stabilizer") == ALL
+    both, base = metrics(tmp_path / "both"), metrics(tmp_path / "base")
+    for key in ("frames", "video", "image", "output_sha256", "spread"):
+        assert both["base"][key] == base[key]
+    assert both["output_sha256"] != base["output_sha256"]
+    page = (tmp_path / "both" / "report.html").read_text()
+    assert page.count("data:image/") == 4
+    assert "tiny with DyFN" in page and "tiny, base model" in page
+    assert "base" not in base
 
 
 def test_scores_are_those_of_the_depth_in_the_output(recording: Path, tmp_path: Path) -> None:

@@ -1,0 +1,171 @@
+"""dyfn-eval reconstruct: poses and a fused cloud, with and without DyFN and from true depth."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
+from dyfn_core.data.frames import DataError
+from dyfn_core.evaluation.cloud_error import write_ply
+from dyfn_core.evaluation.matching import build_matcher
+from dyfn_core.evaluation.pictures import encode_picture
+from dyfn_core.evaluation.reconstruction import OFFSETS, ReconstructionOptions
+from dyfn_core.evaluation.reconstruction_runs import (
+    TABLE_NOTE,
+    RunResult,
+    SequenceRuns,
+    aligned_cloud,
+    draw_run,
+    judge,
+    reconstruct_sequence,
+    reconstruction_table,
+)
+from dyfn_core.evaluation.report import (
+    Part,
+    Picture,
+    Section,
+    Table,
+    Text,
+    text_table,
+    write_report,
+)
+from dyfn_core.models.checkpoints import load_model
+
+COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The sub-command and its options; its function is in `run`."""
+    command = commands.add_parser(
+        "reconstruct",
+        help="poses and a fused cloud from predicted point maps",
+        description=__doc__,
+        epilog="Exit status: 0 done, 3 frames could not be read (the rest was used), 2 unusable.",
+    )
+    add_data_arguments(command)
+    add = command.add_argument
+    add("--matcher", default="dis+sift", help="dis, sift, akaze, orb, or several with +")
+    add("--offsets", type=int, nargs="+", default=list(OFFSETS), help="frames back to match with")
+    add("--threshold", type=float, default=0.05, help="of an inlier, as a share of its depth")
+    add("--with-scale", action="store_true", help="similarity instead of rigid poses")
+    add("--voxel", type=float, default=0.01, help="edge, as a share of the first median depth")
+    add("--seed", type=int, default=0, help="of RANSAC")
+    add("--tolerance", type=float, default=0.05, help="metres, for precision and recall")
+    add("--no-true-depth", dest="true_depth", action="store_false", help="leave the bound out")
+    add("--no-model", dest="with_model", action="store_false", help="true depth alone")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """-> exit status. Raises ValueError, DataError, OSError, ImportError for what is unusable."""
+    settings = ReconstructionOptions(
+        offsets=tuple(options.offsets),
+        threshold=options.threshold,
+        with_scale=options.with_scale,
+        voxel=options.voxel,
+        seed=options.seed,
+    )
+    matcher = build_matcher(options.matcher)
+    sequence = open_sequence(options)
+    chosen = places(options, len(sequence))
+    model = load_model(options.model, options.device) if options.with_model else None
+    found = reconstruct_sequence(
+        sequence,
+        tqdm(chosen, unit="frame", file=sys.stderr),
+        matcher,
+        model,
+        settings,
+        true_depth=options.true_depth,
+        num_tokens=options.num_tokens,
+    )
+    results = {name: judge(found, name, options.tolerance) for name in found.runs}
+    options.out.mkdir(parents=True, exist_ok=True)
+    _write(options, found, results, sequence.name)
+    print(text_table(reconstruction_table(results)))
+    for name, result in results.items():
+        for text in _told(result):
+            print(f"{name}: {text}")
+    for text, count in found.losses.items():
+        print(f"dyfn-eval: loss: {text} ({count} times)", file=sys.stderr)
+    return PARTIAL if found.losses else COMPLETE
+
+
+def _told(result: RunResult) -> list[str]:
+    problems = [f"{count} frames without a pose: {why}" for why, count in result.problems.items()]
+    return [*problems, *result.notes]
+
+
+def _write(
+    options: argparse.Namespace,
+    found: SequenceRuns,
+    results: Mapping[str, RunResult],
+    sequence: str,
+) -> None:
+    out: Path = options.out
+    said = {key: value for key, value in vars(options).items() if key not in ("run", "command")}
+    shown = {key: str(v) if isinstance(v, Path) else v for key, v in said.items()}
+    runs = {name: result.values() for name, result in results.items()}
+    summary = {
+        "sequence": sequence,
+        "options": shown,
+        "runs": runs,
+        "losses": dict(found.losses),
+    }
+    pictures: list[Section] = []
+    for name in found.runs:
+        stem = name.replace(" ", "_").lower()
+        points, colours, metric = aligned_cloud(found, name)
+        runs[name]["ply_in_metres"] = metric
+        picture = draw_run(found, name)
+        (out / f"cloud_{stem}.png").write_bytes(encode_picture(picture))
+        if len(points):
+            write_ply(out / f"cloud_{stem}.ply", points, colours)
+        parts: list[Part] = [Picture(picture, f"cloud, {name}: from above and obliquely")]
+        parts += [Text(text, note=True) for text in _told(results[name])]
+        pictures.append(Section(f"Fused cloud, {name}", parts))
+    _write_frames(out / "frames.csv", found)
+    text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+    (out / "reconstruction.json").write_text(text, encoding="utf-8")
+    scores = Section("Scores", [reconstruction_table(results), Text(TABLE_NOTE, note=True)])
+    facts = Table(("", ""), [[key, _shown(value)] for key, value in shown.items()])
+    title = f"Reconstruction of {Path(sequence).name}"
+    write_report(out / "report.html", title, [scores, *pictures, Section("What was run", [facts])])
+
+
+def _shown(value: object) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def _write_frames(path: Path, found: SequenceRuns) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(("run", "frame", "posed", "pairs", "inliers", "partners", "problem"))
+        for name, run_ in found.runs.items():
+            for index, frame in enumerate(run_.frames):
+                used = " ".join(map(str, frame.partners))
+                posed = int(frame.pose is not None)
+                row = (name, index, posed, frame.pairs, frame.inliers, used, frame.problem or "")
+                writer.writerow(row)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The sub-command by itself, as `python -m dyfn_core.cli.reconstruct reconstruct ...`."""
+    parser = argparse.ArgumentParser(prog="dyfn-eval")
+    add_parser(parser.add_subparsers(dest="command", required=True))
+    options = parser.parse_args(arguments)
+    try:
+        return run(options)
+    except (DataError, OSError, ValueError, ImportError) as error:
+        print(f"dyfn-eval: {error}", file=sys.stderr)
+        return UNUSABLE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""dyfn-eval study: the paper's empirical study on the frames of any data, for any model."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
+from dyfn_core.data.frames import DataError, FrameError, FrameSequence
+from dyfn_core.evaluation.empirical_study import (
+    FACTORS,
+    draw_grid,
+    grid_ranges,
+    statistics_grid,
+    write_grid,
+)
+from dyfn_core.evaluation.report import text_table
+from dyfn_core.models.base import GeometryModel, Latent
+from dyfn_core.models.checkpoints import load_model
+
+COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
+FRAMES = 24
+
+
+def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The sub-command and its options; its function is in `run`."""
+    command = commands.add_parser(
+        "study",
+        help="scale the latent's statistics and see what moves",
+        description=__doc__,
+        epilog="Exit status: 0 done, 3 frames could not be read (the rest was used), 2 unusable.",
+    )
+    add_data_arguments(command)
+    add = command.add_argument
+    add("--frames", type=int, default=FRAMES, help="at most so many, evenly spaced")
+    add("--factors", type=float, nargs="+", default=list(FACTORS), help="of mean and deviation")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """-> exit status. Raises ValueError, DataError or OSError for what cannot be used."""
+    if options.frames < 1:
+        raise ValueError(f"--frames must be at least 1, got {options.frames}")
+    sequence = open_sequence(options)
+    chosen = places(options, len(sequence))
+    spread = np.unique(np.linspace(0, len(chosen) - 1, options.frames).round().astype(int))
+    model = load_model(options.model, options.device)
+    lost: list[str] = []
+    frames = tqdm([chosen[i] for i in spread], unit="frame", file=sys.stderr)
+    latents = _latents(model, sequence, frames, options.num_tokens, lost)
+    grid = statistics_grid(model, latents, tuple(options.factors))
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw_grid(grid, options.out / "statistics_grid.png")
+    write_grid(grid, options.out / "statistics_grid.csv", options.out / "statistics_grid.json")
+    print(text_table(grid_ranges(grid)))
+    print(f"{grid.frames} frames of {sequence.name}; figure and tables in {options.out}")
+    for text in lost:
+        print(f"dyfn-eval: loss: {text}", file=sys.stderr)
+    return PARTIAL if lost else COMPLETE
+
+
+@torch.inference_mode()
+def _latents(
+    model: GeometryModel,
+    sequence: FrameSequence,
+    chosen: Iterable[int],
+    num_tokens: int | None,
+    lost: list[str],
+) -> Iterator[Latent]:
+    """Of the frames that can be read; the others are named in `lost`."""
+    for place in chosen:
+        try:
+            image = sequence.read(place).image
+        except FrameError as error:
+            lost.append(str(error))
+            continue
+        pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
+        yield model.encode(pixels.to(model.device).float() / 255, num_tokens)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """The sub-command by itself, as `python -m dyfn_core.cli.study study ...`."""
+    parser = argparse.ArgumentParser(prog="dyfn-eval")
+    add_parser(parser.add_subparsers(dest="command", required=True))
+    options = parser.parse_args(arguments)
+    try:
+        return run(options)
+    except (DataError, OSError, ValueError) as error:
+        print(f"dyfn-eval: {error}", file=sys.stderr)
+        return UNUSABLE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

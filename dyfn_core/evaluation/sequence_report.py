@@ -1,0 +1,139 @@
+"""The sections of a report on one sequence: scores, curves, pictures, worst frames, latency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dyfn_core.evaluation.report import (
+    Cell,
+    Curves,
+    Histogram,
+    KeyFigures,
+    Part,
+    Picture,
+    Section,
+    Table,
+    Text,
+)
+from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
+
+SCORE_NOTE = (
+    "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
+    "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
+    "shift for the whole sequence. Scale spread: standard deviation of the log of each frame's "
+    "own scale. The controls know nothing of the image: a vertical ramp and a constant."
+)
+WORST_NOTE = (
+    "Worst by AbsRel under the video protocol, one of each stretch of the recording. The pictures "
+    "are chosen while it runs, before the alignment is known: where the worst frame itself was "
+    "not kept, its neighbour in the same stretch is shown."
+)
+
+
+def sequence_sections(
+    runs: Mapping[str, SequenceEvaluation],
+    clouds: Mapping[str, np.ndarray] | None = None,
+    note: str = "",
+) -> list[Section]:
+    """What there is to show of one sequence under one or more ways to run it.
+
+    runs: name -> the evaluation of the same frames; the first is the one the report is about.
+    clouds: name -> picture of a cloud, H x W x 3 uint8 RGB. note: more about the scores.
+    """
+    results = {name: run.results() for name, run in runs.items()}
+    scores: list[Part] = [score_table(results), Text(SCORE_NOTE + note, note=True)]
+    return [
+        Section("At a glance", [_key_figures(next(iter(results.values())))]),
+        Section("Scores", scores),
+        *_over_time(runs),
+        *(
+            Section(f"Frames, {name}", [Picture(run.draw_strip(), f"some frames, {name}")])
+            for name, run in runs.items()
+        ),
+        *(
+            Section(f"Cloud, {name}", [Picture(cloud, f"cloud, {name}")])
+            for name, cloud in (clouds or {}).items()
+        ),
+        *(section for name, run in runs.items() for section in _worst(name, run)),
+        _latency(runs),
+    ]
+
+
+def _key_figures(result: Mapping[str, Any]) -> KeyFigures:
+    video, spread = result["video"] or {}, result["spread"] or {}
+    latency = result["latency_ms"] or {}
+    figures: dict[str, Cell] = {
+        "frames": result["frames"],
+        "AbsRel, video protocol": video.get("abs_rel"),
+        "delta1, video protocol": video.get("delta1"),
+        "spread of log scale": spread.get("log_scale_std"),
+        "latency p50, ms": None if "p50" not in latency else f"{latency['p50']:.1f}",
+        "latency p99, ms": None if "p99" not in latency else f"{latency['p99']:.1f}",
+    }
+    return KeyFigures({name: value for name, value in figures.items() if value is not None})
+
+
+def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
+    rows = {name: run.rows() for name, run in runs.items()}
+
+    def lines(column: str) -> dict[str, list[float | None]]:
+        return {name: [_number(row[column]) for row in found] for name, found in rows.items()}
+
+    scale = {name: _over_median(values) for name, values in lines("scale").items()}
+    if not any(value is not None for values in scale.values() for value in values):
+        return []
+    parts: list[Part] = [
+        Curves("Scale that fits each frame, over its median (flat is stable)", scale),
+        Curves("Shift that fits each frame", lines("shift")),
+        Curves("AbsRel, one alignment for the sequence (video)", lines("video_abs_rel")),
+        Curves("AbsRel, each frame by itself (image)", lines("image_abs_rel")),
+    ]
+    return [Section("Over time", parts)]
+
+
+def _over_median(values: list[float | None]) -> list[float | None]:
+    known = [value for value in values if value is not None]
+    middle = float(np.median(known)) if known else 0.0
+    return [None if value is None or middle == 0 else value / middle for value in values]
+
+
+def _number(cell: Cell) -> float | None:
+    return float(cell) if isinstance(cell, (int, float)) else None
+
+
+def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
+    video = run.video()
+    if video is None:
+        return []
+    rows = run.rows()
+    errors = [_number(row["video_abs_rel"]) for row in rows]
+    table: list[list[Cell]] = []
+    shown = []
+    for index in run.worst.choose(errors):
+        found = run.worst.nearest(index, errors)
+        if found is not None:
+            shown.append(found)
+        stamp = _number(rows[index]["stamp"])
+        picture = "not kept" if found is None else f"frame {found.index}"
+        table.append([f"frame {index}", f"{stamp:.3f}", errors[index], picture])
+    header = ("worst first", "stamp, s", "AbsRel", "picture")
+    parts: list[Part] = [Table(header, table), Text(WORST_NOTE, note=True)]
+    if shown:
+        parts.insert(1, Picture(run.worst.draw(shown, video.scale, video.shift), "worst frames"))
+    return [Section(f"Worst frames, {name}", parts)]
+
+
+def _latency(runs: Mapping[str, SequenceEvaluation]) -> Section:
+    marks = {name: run.latency_ms() or {} for name, run in runs.items()}
+    rows: list[list[Cell]] = [
+        [name, *(f"{value:.1f}" for value in found.values())] for name, found in marks.items()
+    ]
+    values = {
+        name: [value for row in run.rows() if (value := _number(row["latency_ms"])) is not None]
+        for name, run in runs.items()
+    }
+    histogram = Histogram("Time per frame", values, "ms", marks)
+    return Section("Latency", [histogram, Table(("", "p50 ms", "p99 ms"), rows)])

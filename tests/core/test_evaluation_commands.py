@@ -1,0 +1,123 @@
+"""dyfn-eval reconstruct and study, on a made RGB-D folder and a model that is right or random."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from conftest import PinholeModel
+from made_room import FOCAL, SIZE, room_frame
+
+from dyfn_core.cli import reconstruct, study
+from dyfn_core.evaluation.empirical_study import statistics_grid
+from dyfn_core.models.base import Latent
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """rgb/, depth/, K.txt and poses.txt."""
+    folder = tmp_path_factory.mktemp("data") / "room"
+    for part in ("rgb", "depth"):
+        (folder / part).mkdir(parents=True)
+    poses = []
+    for index in range(FRAMES):
+        frame = room_frame(index)
+        cv2.imwrite(str(folder / "rgb" / f"{index:05d}.png"), frame.image[..., ::-1])
+        depth = np.round(frame.depth * 1000).astype(np.uint16)
+        cv2.imwrite(str(folder / "depth" / f"{index:05d}.png"), depth)
+        assert frame.pose is not None
+        poses.append(frame.pose.ravel())
+    np.savetxt(folder / "poses.txt", poses)
+    height, width = SIZE
+    camera = [[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (height - 1) / 2], [0, 0, 1]]
+    np.savetxt(folder / "K.txt", camera)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def pinhole_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(name: str, device: str) -> PinholeModel:
+        return PinholeModel(stabilized=True).eval()
+
+    monkeypatch.setattr(reconstruct, "load_model", load)
+    monkeypatch.setattr(study, "load_model", load)
+
+
+def test_reconstruct_writes_table_clouds_and_report(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["reconstruct", str(room), "--out", str(tmp_path), "--offsets", "1", "3"]
+    assert reconstruct.main([*words, "--matcher", "dis"]) == 0
+    printed = capsys.readouterr().out
+    found = json.loads((tmp_path / "reconstruction.json").read_text())
+    assert set(found["runs"]) == {"true depth", "with DyFN", "base model"}
+    exact = found["runs"]["true depth"]
+    assert (exact["frames"], exact["posed"], exact["ply_in_metres"]) == (FRAMES, FRAMES, True)
+    # Real flow on 80 x 60 pixels: a pixel is 5 cm wide at 3 m.
+    assert exact["trajectory"]["ate"] < 0.04 and exact["cloud"]["chamfer"] < 0.05
+    assert "true depth" in printed and "12 of 12" in printed
+    for name in ("cloud_true_depth.ply", "cloud_true_depth.png", "cloud_base_model.png"):
+        assert (tmp_path / name).stat().st_size > 1000
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/jpeg") == 3 and "ATE m" in page
+    with (tmp_path / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 3 * FRAMES and rows[5]["partners"] == "1 3"
+
+
+def test_wrong_arguments_are_named(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    for wrong, told in (
+        (["--matcher", "x"], "'x' is unknown"),
+        (["--start", "99"], "--start 99 is behind the last of 12 frames"),
+        (["--stride", "0"], "--stride must be at least 1"),
+        (["--sequence", "kitchen"], "no sequence 'kitchen'; there are"),
+        (["--offsets", "0"], "offsets must be frames back"),
+        (["--no-model", "--no-true-depth"], "nothing to reconstruct"),
+    ):
+        assert reconstruct.main(["reconstruct", str(room), *out, *wrong]) == 2
+        assert told in capsys.readouterr().err
+    assert study.main(["study", str(tmp_path / "nowhere"), *out]) == 2
+    assert "nowhere" in capsys.readouterr().err
+    assert study.main(["study", str(room), *out, "--factors", "0"]) == 2
+    assert "above 0" in capsys.readouterr().err
+
+
+def test_study_writes_figure_csv_and_json(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["study", str(room), "--out", str(tmp_path), "--frames", "2"]
+    assert study.main([*words, "--factors", "0.5", "1", "2"]) == 0
+    assert "AbsRel after alignment" in capsys.readouterr().out
+    found = json.loads((tmp_path / "statistics_grid.json").read_text())
+    assert (found["factors"], found["frames"]) == ([0.5, 1.0, 2.0], 2)
+    assert found["scale"][1][1] == pytest.approx(1, abs=1e-3)
+    with (tmp_path / "statistics_grid.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 9
+    assert float(rows[5]["scale"]) == found["scale"][1][2]
+    assert cv2.imread(str(tmp_path / "statistics_grid.png")).std() > 20
+
+
+def test_a_linear_decoder_turns_statistics_into_scale_and_shift() -> None:
+    """Depth = red + 0.5: with factors a, b the fit is 1 / b and what the mean moved by."""
+    torch.manual_seed(0)
+    red = 0.4 + 0.2 * torch.rand(1, 1, 12, 16)
+    latent = Latent(torch.cat([red, 0 * red, 0 * red], 1), (12, 16), (12, 16))
+    grid = statistics_grid(PinholeModel().eval(), [latent], (0.5, 1.0, 2.0))
+    np.testing.assert_allclose(grid.scale, np.tile([2, 1, 0.5], (3, 1)), rtol=2e-3)
+    mean, median = float(red.mean()), float(red.median()) + 0.5
+    for row, a in enumerate(grid.factors):
+        for column, b in enumerate(grid.factors):
+            expected = (mean + 0.5) - (a * mean + 0.5) / b
+            assert grid.shift[row, column] * median == pytest.approx(expected, abs=6e-3)
+    assert grid.abs_rel.max() < 1e-4
