@@ -45,7 +45,10 @@ class FleetOptions:
 
 @dataclass(frozen=True)
 class Job:
-    """One image topic of a recording to replay. name: of its folder and row. key: of all that decides the result."""
+    """One image topic of a recording to replay.
+
+    name: of its folder and row. key: of all that decides the result.
+    """
 
     name: str
     options: Options

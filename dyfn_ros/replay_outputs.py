@@ -144,9 +144,7 @@ class ReplayOutputs:
         if alignment is None:
             note = "no cloud.ply: depth is up to scale, and no ground truth gives its metres"
         else:
-            self.cloud, note = write_cloud(
-                path, spool, alignment, options.voxel, options.depth_max
-            )
+            self.cloud, note = write_cloud(path, spool, alignment, options.voxel, options.depth_max)
             self._done.add(PLY)
         self._notes += [note] if note else []
 

@@ -1,4 +1,4 @@
-"""dyfn-eval: score a model, or any method's files, on public benchmarks of video depth.
+"""dyfn-eval: score a model, or any method's files; rebuild scenes; study the latent.
 
 Exit status: 0 everything was scored; 3 something of the benchmark was missing or could not be
 scored, and --allow-missing let the rest go on; 2 nothing could be scored, or bad arguments.
@@ -14,13 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dyfn_core.cli import reconstruct, study
+from dyfn_core.cli.eval_arguments import add_benchmark, add_model, add_predictions
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate
 from dyfn_core.evaluation.benchmark_table import write_json, write_results
 from dyfn_core.evaluation.benchmarks import (
-    AUTO,
     BENCHMARKS,
-    LAYOUTS,
     Benchmark,
     Opened,
     benchmark,
@@ -35,8 +35,8 @@ from dyfn_core.evaluation.long_sequence import (
     write_lengths,
 )
 from dyfn_core.evaluation.model_method import ModelMethod
-from dyfn_core.evaluation.predictions import QUANTITIES, ArrayMethod, Method, PredictionFolder
-from dyfn_core.evaluation.protocols import ALL_PIXELS, FITS, L1
+from dyfn_core.evaluation.predictions import ArrayMethod, Method, PredictionFolder
+from dyfn_core.evaluation.protocols import ALL_PIXELS
 from dyfn_core.evaluation.report import text_table
 from dyfn_core.models.checkpoints import load_model
 
@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         command: Callable[[argparse.Namespace], int] = options.run
         return command(options)
-    except (DataError, FrameError, OSError, ValueError) as error:
+    except (DataError, FrameError, OSError, ValueError, ImportError) as error:
         print(f"dyfn-eval: {error}", file=sys.stderr)
         return UNUSABLE
     except KeyboardInterrupt:
@@ -200,98 +200,30 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("list", help="the benchmarks: layout, frames, cap, crop")
     command.set_defaults(run=_list)
     command = commands.add_parser("run", help="score a model, with its controls")
-    _add_benchmark(command)
-    _add_model(command, required=True)
+    add_benchmark(command)
+    add_model(command, required=True)
     _add_tables(command)
     command = commands.add_parser("score", help="score predictions from files")
-    _add_benchmark(command)
-    _add_predictions(command, required=True)
+    add_benchmark(command)
+    add_predictions(command, required=True)
     _add_tables(command)
     command = commands.add_parser(
         "long", help="error against length, the alignment solved anew at every length"
     )
-    _add_benchmark(command)
+    add_benchmark(command)
     source = command.add_argument_group("what is scored (one of --model and --predictions)")
     either = source.add_mutually_exclusive_group(required=True)
     either.add_argument("--model", help="checkpoint, Hub id or dyfn-mini")
     either.add_argument("--predictions", type=Path, metavar="DIR", help="see dyfn-eval score")
-    _add_model(command, required=False)
-    _add_predictions(command, required=False)
+    add_model(command, required=False)
+    add_predictions(command, required=False)
     command.add_argument(
         "--lengths", type=int, nargs="+", metavar="N", help="frames (default: 100 200 300 400 500)"
     )
     command.set_defaults(run=_long)
+    reconstruct.add_parser(commands)
+    study.add_parser(commands)
     return parser
-
-
-def _add_benchmark(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--benchmark", required=True, help="a name of `dyfn-eval list`")
-    command.add_argument("--root", type=Path, required=True, help="folder of the data set")
-    command.add_argument("--out", type=Path, required=True, help="folder for the results")
-    command.add_argument("--name", help="of the method in tables")
-    group = command.add_argument_group("what is scored of it (default: as in the paper)")
-    group.add_argument("--layout", choices=LAYOUTS, default=AUTO, help="default: found out")
-    group.add_argument("--sequences", nargs="+", default=[], metavar="NAME", help="only these")
-    group.add_argument("--allow-missing", action="store_true", help="score what is there")
-    group.add_argument("--first", type=int, help="frames left out at the start")
-    group.add_argument("--stride", type=int, help="every so-many-th frame")
-    group.add_argument("--frames", type=int, help="at most so many of a sequence")
-    group.add_argument("--all-frames", action="store_true", help="no limit")
-    group.add_argument("--depth-max", type=float, metavar="METRES", help="cap of the truth")
-    group.add_argument(
-        "--crop", type=int, nargs=2, metavar=("ROWS", "COLUMNS"), help="cut off at each side"
-    )
-    group = command.add_argument_group("how it is scored")
-    group.add_argument(
-        "--fit", choices=FITS, default=L1, help="alignment: weighted L1 (paper), least squares"
-    )
-    group.add_argument(
-        "--all-pixels",
-        action="store_true",
-        help="every pixel, in memory that grows; default: a grid of at most 20000 a frame",
-    )
-
-
-def _add_model(command: argparse.ArgumentParser, required: bool) -> None:
-    group = command.add_argument_group("model")
-    if required:
-        group.add_argument("--model", required=True, help="checkpoint, Hub id or dyfn-mini")
-    group.add_argument(
-        "--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone"
-    )
-    group.add_argument(
-        "--no-controls",
-        dest="controls",
-        action="store_false",
-        help="leave out the moving average and the frozen statistics",
-    )
-    group.add_argument("--num-tokens", type=int, help="how finely to look")
-    group.add_argument(
-        "--known-camera", action="store_true", help="tell the model the benchmark's intrinsics"
-    )
-    group.add_argument("--device", default="cpu", help="of torch (default: cpu)")
-
-
-def _add_predictions(command: argparse.ArgumentParser, required: bool) -> None:
-    group = command.add_argument_group("predictions")
-    if required:
-        group.add_argument(
-            "--predictions",
-            type=Path,
-            required=True,
-            metavar="DIR",
-            help="SEQUENCE.npz, SEQUENCE.npy (T x H x W), or SEQUENCE/ with one .npz, .npy, 16-bit "
-            ".png or .exr a frame",
-        )
-    group.add_argument(
-        "--quantity",
-        choices=QUANTITIES,
-        required=required,
-        default=None if required else QUANTITIES[0],
-        help="depth; disparity: a / depth + b; inverse: a / depth",
-    )
-    group.add_argument("--scale", type=float, help="stored values per unit; needed for .png")
-    group.add_argument("--key", help="of the array in .npz files that hold several")
 
 
 def _add_tables(command: argparse.ArgumentParser) -> None:

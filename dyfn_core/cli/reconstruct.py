@@ -12,7 +12,6 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
-from dyfn_core.data.frames import DataError
 from dyfn_core.evaluation.cloud_error import write_ply
 from dyfn_core.evaluation.matching import build_matcher
 from dyfn_core.evaluation.pictures import encode_picture
@@ -153,19 +152,3 @@ def _write_frames(path: Path, found: SequenceRuns) -> None:
                 posed = int(frame.pose is not None)
                 row = (name, index, posed, frame.pairs, frame.inliers, used, frame.problem or "")
                 writer.writerow(row)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The sub-command by itself, as `python -m dyfn_core.cli.reconstruct reconstruct ...`."""
-    parser = argparse.ArgumentParser(prog="dyfn-eval")
-    add_parser(parser.add_subparsers(dest="command", required=True))
-    options = parser.parse_args(arguments)
-    try:
-        return run(options)
-    except (DataError, OSError, ValueError, ImportError) as error:
-        print(f"dyfn-eval: {error}", file=sys.stderr)
-        return UNUSABLE
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
-from dyfn_core.data.frames import DataError, FrameError, FrameSequence
+from dyfn_core.data.frames import FrameError, FrameSequence
 from dyfn_core.evaluation.empirical_study import (
     FACTORS,
     draw_grid,
@@ -81,19 +81,3 @@ def _latents(
             continue
         pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
         yield model.encode(pixels.to(model.device).float() / 255, num_tokens)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The sub-command by itself, as `python -m dyfn_core.cli.study study ...`."""
-    parser = argparse.ArgumentParser(prog="dyfn-eval")
-    add_parser(parser.add_subparsers(dest="command", required=True))
-    options = parser.parse_args(arguments)
-    try:
-        return run(options)
-    except (DataError, OSError, ValueError) as error:
-        print(f"dyfn-eval: {error}", file=sys.stderr)
-        return UNUSABLE
-
-
-if __name__ == "__main__":
-    sys.exit(main())

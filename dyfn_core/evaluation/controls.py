@@ -38,7 +38,7 @@ class StatisticsControl(Stabilizer):
     def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
         return mean
 
-    def recur(
+    def _step(
         self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         if state is not None and state.ema_mean is not None and state.ema_std is not None:

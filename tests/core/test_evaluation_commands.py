@@ -14,6 +14,7 @@ from conftest import PinholeModel
 from made_room import FOCAL, SIZE, room_frame
 
 from dyfn_core.cli import reconstruct, study
+from dyfn_core.cli.eval import main
 from dyfn_core.evaluation.empirical_study import statistics_grid
 from dyfn_core.models.base import Latent
 
@@ -54,7 +55,7 @@ def test_reconstruct_writes_table_clouds_and_report(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["reconstruct", str(room), "--out", str(tmp_path), "--offsets", "1", "3"]
-    assert reconstruct.main([*words, "--matcher", "dis"]) == 0
+    assert main([*words, "--matcher", "dis"]) == 0
     printed = capsys.readouterr().out
     found = json.loads((tmp_path / "reconstruction.json").read_text())
     assert set(found["runs"]) == {"true depth", "with DyFN", "base model"}
@@ -84,11 +85,11 @@ def test_wrong_arguments_are_named(
         (["--offsets", "0"], "offsets must be frames back"),
         (["--no-model", "--no-true-depth"], "nothing to reconstruct"),
     ):
-        assert reconstruct.main(["reconstruct", str(room), *out, *wrong]) == 2
+        assert main(["reconstruct", str(room), *out, *wrong]) == 2
         assert told in capsys.readouterr().err
-    assert study.main(["study", str(tmp_path / "nowhere"), *out]) == 2
+    assert main(["study", str(tmp_path / "nowhere"), *out]) == 2
     assert "nowhere" in capsys.readouterr().err
-    assert study.main(["study", str(room), *out, "--factors", "0"]) == 2
+    assert main(["study", str(room), *out, "--factors", "0"]) == 2
     assert "above 0" in capsys.readouterr().err
 
 
@@ -96,7 +97,7 @@ def test_study_writes_figure_csv_and_json(
     room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["study", str(room), "--out", str(tmp_path), "--frames", "2"]
-    assert study.main([*words, "--factors", "0.5", "1", "2"]) == 0
+    assert main([*words, "--factors", "0.5", "1", "2"]) == 0
     assert "AbsRel after alignment" in capsys.readouterr().out
     found = json.loads((tmp_path / "statistics_grid.json").read_text())
     assert (found["factors"], found["frames"]) == ([0.5, 1.0, 2.0], 2)
