@@ -260,9 +260,9 @@ class ScaleRunConfig(StabilizerRunConfig):
     """`dyfn-train scale`: DyFN's recurrence from the scale errors of the base's own frames.
 
     summary_draws: clips of `cache_length` frames that are summarised, once, in `cache`; a clip of
-    training is `length` of its frames, sub_strides apart. size_weight, change_weight: of the
-    errors' and the corrections' size beside the errors' spread. noise: added to the summaries,
-    in units of their deviation.
+    training is `length` of its frames, sub_strides apart. spread_weight, video_weight, size_weight,
+    change_weight: of the spread of the scale errors, of the video protocol's error, of the errors'
+    size and of the corrections'. noise: added to the summaries, in units of their deviation.
     """
 
     cache_draws: int = Field(0, ge=0, le=0)
@@ -271,6 +271,7 @@ class ScaleRunConfig(StabilizerRunConfig):
     strides: tuple[int, int] = (1, 1)
     sub_strides: tuple[int, int] = (1, 3)
     clips: int = Field(12, ge=1)
+    video_weight: float = Field(1.0, ge=0)
     size_weight: float = Field(0.2, ge=0)
     change_weight: float = Field(0.02, ge=0)
     noise: float = Field(0.15, ge=0)

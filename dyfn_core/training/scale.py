@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dyfn_core.losses.scale_spread import spread
+from dyfn_core.losses.video_protocol import video_protocol_loss
 from dyfn_core.prediction import StreamState
 from dyfn_core.training.config import ConfigError, ScaleRunConfig
 from dyfn_core.training.latents import LatentClips
@@ -23,8 +24,10 @@ class ScaleTask(StabilizerTask):
     """DyFN in residual form, trained on summaries with the decoder linearised.
 
     A frame whose statistics are corrected by gamma and beta has, to first order, the scale error
-    e + slope . (gamma, beta). The loss is the spread of these errors within a clip, plus a share
-    of their size and of the corrections'. Judged, like every DyFN, with the real decoder.
+    e + slope . (gamma, beta), and its depth is the base's times the exponential of that product.
+    The loss is the spread of these errors within a clip, the video protocol's error of sampled
+    depths, and a share of the errors' size and of the corrections'. Judged, like every DyFN, with
+    the real decoder.
     """
 
     config: ScaleRunConfig
@@ -61,22 +64,26 @@ class ScaleTask(StabilizerTask):
 
     def loss(self, batch: SummaryClips) -> tuple[Tensor, dict[str, float]]:  # type: ignore[override]
         change = self._corrections(batch.summary.float())
+        moved = change @ self.slope
         seen = torch.isfinite(batch.error)
-        error = torch.where(seen, batch.error + change @ self.slope, 0.0)
+        error = torch.where(seen, batch.error + moved, 0.0)
         before = torch.where(seen, batch.error, 0.0)
         terms = {
             "spread": spread(error, seen.float()),
+            "video": video_protocol_loss(batch.depth * moved.exp()[..., None], batch.truth),
             "size": error.abs().sum() / seen.sum().clamp(min=1),
             "change": change.square().mean(),
         }
         weights = {
-            "spread": 1.0,
+            "spread": self.config.spread_weight,
+            "video": self.config.video_weight,
             "size": self.config.size_weight,
             "change": self.config.change_weight,
         }
         total = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         values = {name: float(term.detach()) for name, term in terms.items()}
         values["base_spread"] = float(spread(before, seen.float()))
+        values["base_video"] = float(video_protocol_loss(batch.depth, batch.truth))
         return total, {"loss": float(total.detach()), **values}
 
     def _corrections(self, summary: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
-"""What DyFN's recurrence needs of a clip, and no more: summaries of latents, errors of scale.
+"""What DyFN's recurrence needs of a clip, and no more: summaries of latents, errors, samples.
 
 With a frozen base, everything that decides a frame's scale is known before DyFN runs: the latent,
-the scale error of the base's own depth, and how that error moves with the latent's statistics. A
+the base's own depth and its scale error, and how that error moves with the latent's statistics. A
 clip shrinks from megabytes to kilobytes a frame, and a step of training needs no decoder.
 """
 
@@ -21,15 +21,19 @@ from dyfn_core.training.config import ConfigError
 from dyfn_core.training.latents import CacheFolder, encode_clips, fingerprint
 
 FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
+GRID = (6, 8)  # samples of a frame's depth, evenly spread
 
 
 @dataclass(frozen=True)
 class SummaryClips:
     """B clips of T frames. summary: B x T x C (x h x w) float16, as Stabilizer.summarise gives it.
-    error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any."""
+    error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any. depth,
+    truth: B x T x N, the base's z and the true one (NaN where unknown) at the same N pixels."""
 
     summary: Tensor
     error: Tensor
+    depth: Tensor
+    truth: Tensor
 
 
 class SummaryCache:
@@ -47,7 +51,9 @@ class SummaryCache:
         files.build(source, partial(summarise_clips, model))
         parts = files.load()
         self.summary = torch.cat([part["summary"] for part in parts])
-        self.error = torch.cat([part["error"] for part in parts])
+        self.error, self.depth, self.truth = (
+            torch.cat([part[name] for part in parts]) for name in ("error", "depth", "truth")
+        )
         self.slope = torch.stack([part["slope"] for part in parts]).mean(0)
 
     def usual(self) -> tuple[Tensor, Tensor]:
@@ -65,13 +71,12 @@ class SummaryCache:
         while True:
             draw = torch.Generator().manual_seed(seed * 1_000_003 + step)
             chosen = [self._sub_clip(length, (strides[0], longest), draw) for _ in range(clips)]
-            summary, error = (torch.stack(parts) for parts in zip(*chosen, strict=True))
-            yield SummaryClips(summary, error)
+            yield SummaryClips(*(torch.stack(parts) for parts in zip(*chosen, strict=True)))
             step += 1
 
     def _sub_clip(
         self, length: int, strides: tuple[int, int], draw: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         def below(limit: int) -> int:
             return int(torch.randint(limit, (1,), generator=draw))
 
@@ -80,55 +85,75 @@ class SummaryCache:
         index = below(frames - (length - 1) * stride) + stride * torch.arange(length)
         if below(2):
             index = index.flip(0)
-        return self.summary[clip, index], self.error[clip, index]
+        parts = (self.summary, self.error, self.depth, self.truth)
+        return tuple(part[clip, index] for part in parts)
 
 
 def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
-    """summary B x T x C (x h x w) float16, error B x T, slope 2C of the clips' first frames."""
+    """summary, error, depth and truth as in SummaryClips, slope 2C of the clips' first frames."""
     stabilizer = model.stabilizer
     assert stabilizer is not None
     clips = encode_clips(model, batch)
     aspect = clips.image_size[1] / clips.image_size[0]
     half = (clips.image_size[0] // 2, clips.image_size[1] // 2)
-    summaries, errors, slopes = [], [], []
+    summaries, errors, slopes, depths, truths = [], [], [], [], []
     for latent, depth, intrinsics in zip(
         clips.latent.float(), clips.depth.float(), batch.intrinsics, strict=True
     ):
         with torch.no_grad():
             summaries.append(stabilizer.summarise(latent, latent.mean((-2, -1))).half())
-            level = mean_log_z(model, Latent(latent, half, clips.network_size), depth)
+            z = decoded_z(model, Latent(latent, half, clips.network_size))
+            level = mean_log(z, depth)
         focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / (aspect**2 + 1) ** 0.5
         valid = torch.isfinite(depth) & (depth > 0)
         truth = torch.where(valid, depth, 1.0).log().sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
         seen = valid.sum((1, 2)) >= FEWEST_PIXELS
         errors.append(torch.where(seen, level - truth + focal.log(), torch.nan))
+        depths.append(samples(z))
+        truths.append(samples(torch.where(valid, depth, torch.nan)))
         slopes.append(scale_slope(model, Latent(latent[:1], half, clips.network_size), depth[:1]))
     return {
         "summary": torch.stack(summaries).contiguous(),
         "error": torch.stack(errors),
+        "depth": torch.stack(depths),
+        "truth": torch.stack(truths),
         "slope": torch.stack(slopes).mean(0),
     }
 
 
-def mean_log_z(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
-    """B: mean of log z over the pixels where depth (B x h x w) is valid, else over all."""
+def decoded_z(model: GeometryModel, latent: Latent) -> Tensor:
+    """B x h x w, positive. Raises ConfigError for a base of disparity."""
     affine = model.decode(latent)
     if isinstance(affine, AffineDisparity):
         raise ConfigError("the scale of a base of disparity is not a scale of depth")
-    log_z = affine.points[..., 2].clamp(min=1e-6).log()
+    return affine.points[..., 2].clamp(min=1e-6)
+
+
+def mean_log(z: Tensor, depth: Tensor) -> Tensor:
+    """B: mean of log z (B x h x w) over the pixels where depth is valid, else over all."""
     valid = torch.isfinite(depth) & (depth > 0)
     valid = valid | (valid.sum((1, 2), keepdim=True) == 0)
-    return torch.where(valid, log_z, 0.0).sum((1, 2)) / valid.sum((1, 2))
+    return torch.where(valid, z.log(), 0.0).sum((1, 2)) / valid.sum((1, 2))
+
+
+def samples(image: Tensor) -> Tensor:
+    """B x h x w -> B x N, the pixels in the middle of GRID's cells."""
+    rows, columns = (
+        ((torch.arange(cells) + 0.5) * size / cells).long()
+        for cells, size in zip(GRID, image.shape[1:], strict=True)
+    )
+    return image[:, rows[:, None], columns[None]].flatten(1).contiguous()
 
 
 def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
-    """2C: derivative of mean_log_z by the residual gamma and beta, at zero, mean over frames."""
+    """2C: derivative of mean_log by the residual gamma and beta, at zero, mean over frames."""
     features = latent.features
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
     change = features.new_zeros(2, features.shape[1], requires_grad=True)
     gamma, beta = change[0].view(1, -1, 1, 1), change[1].view(1, -1, 1, 1)
     with torch.enable_grad():
         moved = gamma.exp() * (features - mean) + mean + std * beta
-        level = mean_log_z(model, Latent(moved, latent.image_size, latent.network_size), depth)
+        z = decoded_z(model, Latent(moved, latent.image_size, latent.network_size))
+        level = mean_log(z, depth)
         (slope,) = torch.autograd.grad(level.mean(), change)
     return slope.flatten()

@@ -19,7 +19,7 @@ from dyfn_core.training.config import ConfigError, ScaleRunConfig, read_config
 from dyfn_core.training.latents import encode_clips
 from dyfn_core.training.run_folder import read_log
 from dyfn_core.training.scale import ScaleTask
-from dyfn_core.training.summaries import mean_log_z, scale_slope, summarise_clips
+from dyfn_core.training.summaries import decoded_z, mean_log, scale_slope, summarise_clips
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +56,22 @@ def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Pat
     assert parts["summary"].shape == (1, 4, 8, 2, 4)
 
 
+def test_samples_pair_the_bases_depth_with_the_true_one(place: Path, tmp_path: Path) -> None:
+    made = task(place, tmp_path)
+    batch = draw_batch(made.source, find_sequences(made.source, "train"), 0)
+    parts = summarise_clips(made.model, batch)
+    clips = encode_clips(made.model, batch)
+    latent = Latent(clips.latent[0].float(), (16, 32), clips.network_size)
+    z = decoded_z(made.model, latent).detach()
+    assert parts["depth"].shape == parts["truth"].shape == (1, 4, 48)
+    rows, columns = (torch.arange(6) * 16 + 8) // 6, torch.arange(8) * 4 + 2
+    torch.testing.assert_close(parts["depth"][0, 1], z[1][rows][:, columns].flatten())
+    true = clips.depth[0, 1].float()[rows][:, columns].flatten()
+    known = torch.isfinite(true) & (true > 0)
+    assert torch.equal(torch.isfinite(parts["truth"][0, 1]), known)
+    assert torch.equal(parts["truth"][0, 1][known], true[known])
+
+
 def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path: Path) -> None:
     made = task(place, tmp_path)
     torch.manual_seed(3)
@@ -67,7 +83,8 @@ def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path:
     gamma, beta = (part.view(1, 8, 1, 1) for part in change.chunk(2))
     moved = replace(latent, features=gamma.exp() * (features - mean) + mean + std * beta)
     with torch.no_grad():
-        found = mean_log_z(made.model, moved, depth) - mean_log_z(made.model, latent, depth)
+        after, before = (decoded_z(made.model, one) for one in (moved, latent))
+        found = mean_log(after, depth) - mean_log(before, depth)
     torch.testing.assert_close(found[0], slope @ change, rtol=0.05, atol=1e-5)
 
 

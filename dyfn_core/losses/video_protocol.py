@@ -1,0 +1,31 @@
+"""The video protocol's own error as a loss (paper section 5)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dyfn_core.geometry.alignment import fit_scale_shift
+
+FEWEST = 16  # valid samples of a clip, as of a frame in evaluation
+
+
+def video_protocol_loss(prediction: Tensor, truth: Tensor) -> Tensor:
+    """Mean of |s p + t - d| / d with the best s and t of each clip, averaged over the clips.
+
+    prediction: B x T x N, positive; truth: B x T x N metres, not finite where it is unknown. s and
+    t are the exact minimum of this same error, so no gradient has to flow through them: at a
+    minimum it is that of the error with s and t held. Clips with fewer than FEWEST known samples
+    count for nothing; without any other clip the loss is 0.
+    """
+    losses = []
+    for p, d in zip(prediction.flatten(1), truth.flatten(1), strict=True):
+        known = torch.isfinite(d)
+        if known.sum() < FEWEST:
+            continue
+        p, d = p[known], d[known]
+        scale, shift = fit_scale_shift(
+            p.detach().cpu().numpy(), d.cpu().numpy(), (1 / d).cpu().numpy()
+        )
+        losses.append(((scale * p + shift - d).abs() / d).mean())
+    return torch.stack(losses).mean() if losses else 0.0 * prediction.sum()
