@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyfn_core.evaluation.cloud_error import write_ply
 from dyfn_core.evaluation.cloud_pictures import draw_fused
 from dyfn_core.geometry.registration import Similarity
 from dyfn_core.geometry.voxel_grid import VoxelGrid
@@ -24,8 +25,6 @@ def write_cloud(
     Returns the cloud and the camera's path from above (H x W x 3 uint8 RGB, None without a point),
     and what to warn about, "" for nothing. Raises OutputError.
     """
-    import trimesh  # slow to import
-
     grid = VoxelGrid(voxel)
     poses: list[Similarity] = []
     lost = 0
@@ -39,9 +38,8 @@ def write_cloud(
     if len(points) == 0:
         path.unlink(missing_ok=True)  # of an earlier run
         return None, f"no {path.name}: {spool.frames} frames, {lost} without a pose, gave no point"
-    cloud = trimesh.PointCloud(points, colours)
     with finished_file(path) as partial:
-        partial.write_bytes(cloud.export(file_type="ply"))
+        write_ply(partial, points, colours)
     notes = []
     if lost:
         notes.append(f"{lost} of {spool.frames} frames have no pose and are not in it")

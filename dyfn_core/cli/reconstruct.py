@@ -63,7 +63,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def run(options: argparse.Namespace) -> int:
-    """-> exit status. Raises ValueError, DataError, OSError, ImportError for what is unusable."""
+    """-> exit status. Raises ValueError, DataError or OSError for what is unusable."""
     settings = ReconstructionOptions(
         offsets=tuple(options.offsets),
         threshold=options.threshold,

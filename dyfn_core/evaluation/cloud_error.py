@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class CloudError:
 def cloud_error(estimated: np.ndarray, truth: np.ndarray, tolerance: float) -> CloudError:
     """Compare clouds N x 3 and M x 3 in one frame and unit.
 
-    Raises ValueError for an empty cloud, ImportError naming the extra when scipy is missing.
+    Raises ValueError for an empty cloud.
     """
     if not len(estimated) or not len(truth):
         raise ValueError(f"clouds of {len(estimated)} and {len(truth)} points cannot be compared")
@@ -48,26 +47,15 @@ def cloud_error(estimated: np.ndarray, truth: np.ndarray, tolerance: float) -> C
 
 
 def _nearest(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    distances, _ = _extra("scipy.spatial").cKDTree(others).query(points)
+    distances, _ = cKDTree(others).query(points)
     return np.asarray(distances)
 
 
 def write_ply(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
-    """Binary PLY of N points (float32) with N x 3 uint8 RGB; it appears only when complete.
+    """Binary PLY of N points (float32) with N x 3 uint8 RGB; it appears only when complete."""
+    import trimesh  # slow to import
 
-    Raises ImportError naming the extra when trimesh is missing.
-    """
-    cloud = _extra("trimesh").PointCloud(points, colours)
+    cloud = trimesh.PointCloud(points, colours)
     partial = path.with_name(f"{path.name}.partial")
     partial.write_bytes(cloud.export(file_type="ply"))
     partial.replace(path)
-
-
-def _extra(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ImportError(
-            f"{name.partition('.')[0]} is needed for this: install the package with its `eval` "
-            "extra"
-        ) from error
