@@ -16,6 +16,7 @@ from dyfn_ros.recordings import RecordedFrame
 from dyfn_ros.replay_recording import score_values, subsampled
 
 APPLICATION = "dyfn_replay"
+PATIENCE = 60.0  # seconds for the library's thread to write what it still holds
 
 
 def load_rerun() -> Any:
@@ -72,7 +73,7 @@ class RerunRecording:
     def _end(self) -> None:
         from rerun.chunk import RrdReader
 
-        self._recording.flush()
+        self._recording.flush(timeout_sec=PATIENCE)
         self._recording.disconnect()
         if self._frames and not RrdReader(self._partial).recordings():  # an intact index
             raise ValueError("the file holds no recording after it was written")
