@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,6 +18,7 @@ from dyfn_ros.replay_recording import score_values, subsampled
 
 APPLICATION = "dyfn_replay"
 PATIENCE = 60.0  # seconds for the library's thread to write what it still holds
+ROOM = 64 * 2**20  # bytes that must be free on the disk before a frame
 
 
 def load_rerun() -> Any:
@@ -35,8 +37,9 @@ class RerunRecording:
     of score_values.
 
     On the timelines `stamp` and `frame`. Depth and points are as the model said them, up to
-    scale. The library writes in a thread of its own and only logs a full disk: the file is read
-    back at the end, and an incomplete one is an OutputError.
+    scale. The library writes in a thread of its own, which only logs a full disk and has been seen
+    never to return from one: a disk with less than ROOM is an OutputError before that. The file is
+    read back at the end, and an incomplete one is an OutputError too.
     """
 
     def __init__(self, path: Path, name: str) -> None:
@@ -80,6 +83,12 @@ class RerunRecording:
 
     def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
         """Everything of one frame."""
+        free = shutil.disk_usage(self._path.parent).free
+        if free < ROOM:
+            raise OutputError(
+                f"{self._path}: cannot be written: {free / 2**20:.0f} MB are free, "
+                f"{ROOM / 2**20:.0f} MB are needed"
+            )
         rr, log = self._rerun, self._recording.log
         self._recording.set_time("frame", sequence=self._frames)
         self._recording.set_time("stamp", timestamp=np.datetime64(frame.stamp_ns, "ns"))

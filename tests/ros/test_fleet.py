@@ -183,7 +183,7 @@ def test_a_worker_that_dies_takes_no_other_along(
     assert found[CRASHED][1] == Outcome(CRASHED, "its process ended with code -9")
     survivor = found[ALL][0].options
     other = json.loads((survivor.out / "metrics.json").read_text())
-    alone = Options(survivor.recording, tmp_path / "alone", model="tiny", write=(), threads=1)
+    alone = Options(survivor.recording, tmp_path / "alone", model="tiny", write=())
     assert other["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
 
 
@@ -201,7 +201,7 @@ def test_ray_does_the_same(
     assert run(tmp_path / "out", *chosen, "--ray", "local") == PARTIAL
     assert "broken.mcap: failed (code 2)" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "a" / "metrics.json").read_text())
-    alone = Options(walks / "a", tmp_path / "alone", model="tiny", write=(), threads=1)
+    alone = Options(walks / "a", tmp_path / "alone", model="tiny", write=())
     assert found["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
 
 

@@ -1,12 +1,10 @@
 """Cloud, video and Rerun recording of a replay, by value; poses; disks that are full."""
 
 import json
-import os
 import resource
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -25,6 +23,7 @@ from dyfn_ros.recording_writer import write_rgbd_recording as record
 from dyfn_ros.recordings import open_recording
 from dyfn_ros.replay import ALL, UNUSABLE, main
 from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
+from dyfn_ros.replay_rerun import ROOM
 from dyfn_ros.replay_video import Alignment
 
 SIZE = (36, 48)
@@ -227,29 +226,18 @@ def noisy_walk(folder: Path) -> list[str]:
     return [str(folder / "walk"), "--out", str(folder / "out"), "--model", "tiny"]
 
 
-FULL_DISK = """
-import resource, sys
-from dyfn_ros.replay import main
-from tiny_model import load_tiny
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
-sys.exit(main([*sys.argv[1:], "--write", "rrd"], load_tiny))
-"""
-
-
-def test_a_full_disk_leaves_no_half_rerun_recording(tmp_path: Path) -> None:
-    """In a process of its own: the library writes in a thread that once was not heard of again."""
+def test_a_full_disk_leaves_no_half_rerun_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
-    done = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, *noisy_walk(tmp_path)],
-        cwd=Path(__file__).parent,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])},
-        capture_output=True,
-        text=True,
-        timeout=180,
+    room = iter([ROOM, ROOM, ROOM - 1])
+    monkeypatch.setattr(
+        "dyfn_ros.replay_rerun.shutil.disk_usage", lambda _: SimpleNamespace(free=next(room))
     )
-    assert done.returncode == UNUSABLE, done.stderr
-    assert "cannot be written" in done.stderr
+    assert main([*noisy_walk(tmp_path), "--write", "rrd"], load_tiny) == UNUSABLE
+    assert "output.rrd: cannot be written: 64 MB are free" in capsys.readouterr().err
     assert list((tmp_path / "out").iterdir()) == []
+    assert next(room, None) is None
 
 
 def odometry(path: Path, tie: bool) -> None:
