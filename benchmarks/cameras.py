@@ -80,6 +80,10 @@ class Feeder:
         self._sent[camera] = time.perf_counter()
         self._publishers[camera].publish(message)
 
+    def resend(self, camera: str) -> None:
+        """After a frame that was dropped on purpose."""
+        self._send(camera)
+
     def prime(self, process: NodeProcess) -> None:
         """Until every camera's depth comes back."""
         deadline = time.monotonic() + PATIENCE
