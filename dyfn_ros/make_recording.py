@@ -13,6 +13,7 @@ from typing import get_args
 
 import numpy as np
 
+from dyfn_ros.arguments import above_zero, at_least_one
 from dyfn_ros.camera_yaml import read_camera_yaml
 from dyfn_ros.recording_sources import folder_frames, video_frames
 from dyfn_ros.recording_writer import (
@@ -71,30 +72,16 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     add("--intrinsics", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="pixels")
     add("--distortion", type=float, nargs="+", metavar="K", help="of a video: k1 k2 p1 p2 [k3 ...]")
     add("--camera-info", type=Path, help="of a video: calibration YAML in the ROS format")
-    add("--depth-scale", type=_above_zero, help="stored depth values per metre")
-    add("--rate", type=_above_zero, help="frames a second of folders without stamps")
-    add("--stride", type=_at_least_one, default=1, help="take every N-th frame")
-    add("--max-frames", type=_at_least_one, help="stop after so many")
+    add("--depth-scale", type=above_zero, help="stored depth values per metre")
+    add("--rate", type=above_zero, help="frames a second of folders without stamps")
+    add("--stride", type=at_least_one, default=1, help="take every N-th frame")
+    add("--max-frames", type=at_least_one, help="stop after so many")
     add("--namespace", default="/camera", help="of the topics")
     add("--frame-id", default="camera_optical")
     given = vars(parser.parse_args(arguments))
     for name in ("intrinsics", "distortion"):
         given[name] = None if given[name] is None else tuple(given[name])
     return Options(**given)
-
-
-def _at_least_one(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
-    return value
-
-
-def _above_zero(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} must be above 0")
-    return value
 
 
 def make_recording(options: Options) -> tuple[int, Counter[str]]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from dyfn_ros.arguments import above_zero, at_least_one, not_negative
 from dyfn_ros.recordings import image_topics
 from dyfn_ros.replay_outputs import DEFAULT, FILES, VOXEL, parse_outputs
 from dyfn_ros.threads import THREADS
@@ -102,7 +103,7 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     _add_model_options(parser)
     _add_input_options(parser)
     _add_output_options(parser)
-    add("--jobs", type=_positive, default=1, help="processes for several recordings")
+    add("--jobs", type=at_least_one, default=1, help="processes for several recordings")
     add("--ray", metavar="ADDRESS", help='Ray cluster for several recordings; "local" makes one')
     given = vars(parser.parse_args(arguments))
     recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
@@ -121,18 +122,18 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
     add("--compare", action="store_true", help="also run the base model, for one report on both")
-    add("--num-tokens", type=_positive, help="resolution inside the model")
+    add("--num-tokens", type=at_least_one, help="resolution inside the model")
     add("--device", default="cpu", help="cpu, cuda, cuda:N")
     add(
         "--threads",
-        type=_count,
+        type=not_negative,
         default=THREADS,
         help="CPU threads for inference, to which the last bits of the result belong "
         f"(default: {THREADS}; 0: torch's own choice)",
     )
     add(
         "--scene-cut-threshold",
-        type=_distance,
+        type=above_zero,
         default=0.0,
         help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
     )
@@ -165,16 +166,16 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
         metavar="'X Y Z QX QY QZ QW'",
         help="pose of the depth camera or of the cloud's sensor in the image's optical frame",
     )
-    add("--depth-max", type=_distance, default=math.inf, help="cap of the ground truth, metres")
-    add("--tolerance", type=_distance, default=0.02, help="seconds from image to ground truth")
+    add("--depth-max", type=above_zero, default=math.inf, help="cap of the ground truth, metres")
+    add("--tolerance", type=above_zero, default=0.02, help="seconds from image to ground truth")
     add(
         "--stamps",
         choices=("header", "log"),
         default="header",
         help="times from the messages' headers, or the times of recording",
     )
-    add("--max-frames", type=_positive, help="stop after so many frames")
-    add("--stride", type=_positive, default=1, help="take every N-th frame")
+    add("--max-frames", type=at_least_one, help="stop after so many frames")
+    add("--stride", type=at_least_one, default=1, help="take every N-th frame")
 
 
 def _add_output_options(parser: argparse.ArgumentParser) -> None:
@@ -189,7 +190,7 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
     )
     add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
     add("--pose-topic", help='poses, odometry or TF for cloud.ply; "none" for no cloud')
-    add("--voxel", type=_distance, default=VOXEL, help="voxels of cloud.ply, metres")
+    add("--voxel", type=above_zero, default=VOXEL, help="voxels of cloud.ply, metres")
 
 
 def _outputs(text: str) -> tuple[str, ...]:
@@ -197,24 +198,3 @@ def _outputs(text: str) -> tuple[str, ...]:
         return parse_outputs(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} must not be negative")
-    return value
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
-    return value
-
-
-def _distance(text: str) -> float:
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text} must be above 0")
-    return value
