@@ -12,8 +12,10 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
+from dyfn_core.evaluation.protocols import to_shape
 from dyfn_core.evaluation.report import text_table
 from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
@@ -42,21 +44,54 @@ def load(name: str, device: str) -> GeometryModel:
 def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     """Replay one image topic and write everything into options.out; -> metrics.json's content.
 
-    Raises RecordingError for a recording that cannot be used, OutputError for a file that cannot
-    be written, and what load_model raises.
+    With a prediction_topic no model runs: its depth images are scored. Raises RecordingError for
+    a recording that cannot be used, OutputError for a file that cannot be written, and what
+    load_model raises.
     """
     recording = _open(options)
-    model = loader(options.model, options.device)
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.prediction_topic is not None:
+        evaluation = score_topic(options, recording)
+        _require_frames(options, recording, evaluation)
+        name = options.prediction_topic
+        return write_results(options, Result(recording, name, False, evaluation, None, 0, None))
+    model = loader(options.model, options.device)
     with computing_threads(options.threads) as threads:
         outputs = _outputs_of(options, recording)
         evaluation = _run(options, recording, model, outputs)
-        if evaluation.frames == 0:
-            reasons = "; ".join(recording.notes.losses) or "it holds no frames"
-            raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
+        _require_frames(options, recording, evaluation)
         base = _run_base(options, model) if options.compare else None
-    result = Result(recording, model, evaluation, base, threads, outputs.cloud)
+    stabilized = options.stabilizer and model.stabilizer is not None
+    result = Result(recording, options.model, stabilized, evaluation, base, threads, outputs.cloud)
     return write_results(options, result)
+
+
+def _require_frames(options: Options, recording: Recording, evaluation: SequenceEvaluation) -> None:
+    if evaluation.frames == 0:
+        reasons = "; ".join(recording.notes.losses) or "it holds no frames"
+        raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
+
+
+def score_topic(options: Options, recording: Recording) -> SequenceEvaluation:
+    """The depth that some method recorded on prediction_topic, matched and registered as truth is.
+
+    Images without a prediction are counted in the recording's warnings and cover nothing.
+    """
+    topic = options.prediction_topic
+    other = replace(options, depth_topic=topic, depth_info_topic=None, depth_transform=None)
+    frames, expected = _frames(options, recording)
+    predictions, _ = _frames(other, _open(other))
+    evaluation = SequenceEvaluation(expected, options.depth_max)
+    for frame, predicted in zip(frames, predictions, strict=True):
+        said = predicted.depth
+        if said is None:
+            recording.notes.warnings[f"{topic}: no prediction for an image"] += 1
+            said = np.full(frame.image.shape[:2], np.nan, np.float32)
+        said = to_shape(said, frame.image.shape[:2])
+        valid = np.isfinite(said) & (said > 0)
+        stamp = frame.stamp_ns * 1e-9
+        evaluation.push(frame.image, said, valid, frame.depth, stamp=stamp, latency=0.0)
+    return evaluation
 
 
 def _open(options: Options) -> Recording:

@@ -27,6 +27,7 @@ class Options:
     all_topics: bool = False
     camera_info_topic: str | None = None
     depth_topic: str | None = None
+    prediction_topic: str | None = None
     depth_info_topic: str | None = None
     depth_transform: str | None = None
     stamps: Literal["header", "log"] = "header"
@@ -159,6 +160,10 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
         "--depth-topic",
         help='ground truth: depth images (16UC1 mm, 32FC1 m, compressed) or a PointCloud2; "none" '
         "for no scores",
+    )
+    add(
+        "--prediction-topic",
+        help="score the depth images of this topic, whoever made them, instead of a model's",
     )
     add("--depth-info-topic", help="CameraInfo of a depth camera that is not the image's")
     add(

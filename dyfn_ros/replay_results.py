@@ -19,7 +19,6 @@ from dyfn_ros.finished_file import finished_file
 from dyfn_ros.recordings import Recording
 
 if TYPE_CHECKING:
-    from dyfn_core.models.base import GeometryModel
     from dyfn_ros.replay_options import Options
 
 
@@ -27,12 +26,14 @@ if TYPE_CHECKING:
 class Result:
     """A replay that has ended.
 
-    base: the same frames without DyFN, if they were run. threads: that computed. cloud: picture
-    of the fused cloud, H x W x 3 uint8 RGB.
+    name: of the model, or the topic of the predictions. stabilized: with DyFN. base: the same
+    frames without DyFN, if they were run. threads: that computed, 0 where no model ran. cloud:
+    picture of the fused cloud, H x W x 3 uint8 RGB.
     """
 
     recording: Recording
-    model: GeometryModel
+    name: str
+    stabilized: bool
     evaluation: SequenceEvaluation
     base: SequenceEvaluation | None
     threads: int
@@ -58,13 +59,13 @@ def write_results(options: Options, result: Result) -> dict[str, Any]:
 
 
 def _metrics(options: Options, result: Result) -> dict[str, Any]:
-    recording, model = result.recording, result.model
+    recording = result.recording
     results = result.evaluation.results()
     return {
         "frames": results.pop("frames"),
-        "model": options.model,
-        "stabilizer": options.stabilizer and model.stabilizer is not None,
-        "quantity": model.quantity,
+        "model": result.name,
+        "stabilizer": result.stabilized,
+        "quantity": result.evaluation.quantity,
         **results,
         **({} if result.base is None else {"base": result.base.results()}),
         "recording": {
@@ -98,7 +99,7 @@ def _write_report(path: Path, options: Options, metrics: dict[str, Any], result:
     facts: list[list[str | float | int | None]] = [
         ["recording", str(options.recording)],
         ["frames", metrics["frames"]],
-        ["model", options.model],
+        ["model", metrics["model"]],
         ["DyFN", "on" if metrics["stabilizer"] else "off"],
         ["valid share of the pixels with truth", metrics["coverage"]],
         ["output SHA-256", metrics["output_sha256"][:16]],
@@ -121,6 +122,8 @@ def _write_report(path: Path, options: Options, metrics: dict[str, Any], result:
 
 def run_name(metrics: dict[str, Any]) -> str:
     """How a run is called in tables."""
+    if metrics["model"].startswith("/"):  # a topic: who made it is not known
+        return str(metrics["model"])
     return f"{metrics['model']}{' with DyFN' if metrics['stabilizer'] else ', base model'}"
 
 

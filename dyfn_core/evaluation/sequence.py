@@ -84,6 +84,11 @@ class SequenceEvaluation:
         return score
 
     @property
+    def quantity(self) -> str:
+        """What is pushed: depth or disparity."""
+        return self.scores.scorer.quantity
+
+    @property
     def frames(self) -> int:
         """Frames pushed so far."""
         return len(self._stamps)

@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from tiny_model import load_tiny
 
+from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_ros.messages import cloud_points, decode_depth
 from dyfn_ros.recording_writer import IMAGE, TYPES, RecordingWriter, RgbdFrame, write_rgbd_recording
@@ -286,6 +287,54 @@ def test_every_image_topic_is_a_stream_with_a_folder(tmp_path: Path) -> None:
     run(tmp_path / "walk", tmp_path / "alone", "--image-topic", "/right/image")
     assert metrics(tmp_path / "alone")["output_sha256"] == right["output_sha256"]
     assert left["output_sha256"] != right["output_sha256"]
+
+
+def other_method(path: Path) -> list[RgbdFrame]:
+    """A camera, its truth, and another node's depth that drifts; that node missed the second."""
+    frames = rgbd(4)
+    with RecordingWriter(path) as writer:
+        for index, frame in enumerate(frames):
+            stamp = (1 + index) * 1_000_000_000
+            truth = frame.depth_m
+            assert truth is not None
+            writer.write_image("/camera/image", frame.image, stamp, "camera")
+            writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "camera")
+            writer.write_depth("/camera/depth", truth, stamp, "camera")
+            if index != 1:
+                said = (truth * 0.5 + 0.2) * 1.2**index
+                writer.write_depth("/other/depth", np.where(truth > 0, said, 0), stamp, "camera")
+    return frames
+
+
+def test_another_methods_topic_is_scored_as_it_stands(tmp_path: Path) -> None:
+    frames = other_method(tmp_path / "walk")
+    out = tmp_path / "out"
+    topics = ("--depth-topic", "/camera/depth", "--prediction-topic", "/other/depth")
+    assert run(tmp_path / "walk", out, *topics) == ALL
+    found = metrics(out)
+    assert (found["frames"], found["model"], found["stabilizer"]) == (4, "/other/depth", False)
+    assert found["recording"]["warnings"] == {"/other/depth: no prediction for an image": 1}
+    scorer = SequenceScorer()
+    for index, frame in enumerate(frames):
+        truth = np.asarray(frame.depth_m)
+        said = (truth * 0.5 + 0.2) * 1.2**index
+        known = (truth > 0) & (index != 1)
+        scorer.push(np.where(known, said, np.nan), np.where(truth > 0, truth, np.nan))
+    image, video = scorer.image(), scorer.video()
+    assert image is not None and video is not None
+    assert found["image"]["abs_rel"] == pytest.approx(image.metrics["abs_rel"], abs=1e-6)
+    assert found["video"]["abs_rel"] == pytest.approx(video.metrics["abs_rel"], abs=1e-6)
+    assert found["video"]["abs_rel"] > 0.05 > found["image"]["abs_rel"]
+    assert "/other/depth" in (out / "report.html").read_text()
+
+
+def test_a_prediction_topic_that_is_not_there_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other_method(tmp_path / "walk")
+    topics = ("--depth-topic", "/camera/depth", "--prediction-topic", "/nobody")
+    assert run(tmp_path / "walk", tmp_path / "out", *topics) == UNUSABLE
+    assert "/nobody" in capsys.readouterr().err
 
 
 def test_of_several_topics_one_that_fails_does_not_stop_the_others(
