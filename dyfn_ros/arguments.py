@@ -22,8 +22,16 @@ def not_negative(text: str) -> int:
 
 
 def above_zero(text: str) -> float:
-    """A number above 0; infinity is none."""
+    """A number above 0, also infinity: no limit."""
     value = float(text)
-    if not 0 < value < float("inf"):
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text} must be above 0")
+    return value
+
+
+def finite_above_zero(text: str) -> float:
+    """As above_zero, without infinity."""
+    value = above_zero(text)
+    if value == float("inf"):
         raise argparse.ArgumentTypeError(f"{text} must be above 0")
     return value

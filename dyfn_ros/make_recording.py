@@ -13,7 +13,7 @@ from typing import get_args
 
 import numpy as np
 
-from dyfn_ros.arguments import above_zero, at_least_one
+from dyfn_ros.arguments import at_least_one, finite_above_zero
 from dyfn_ros.camera_yaml import read_camera_yaml
 from dyfn_ros.recording_sources import folder_frames, video_frames
 from dyfn_ros.recording_writer import (
@@ -72,8 +72,8 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     add("--intrinsics", type=float, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="pixels")
     add("--distortion", type=float, nargs="+", metavar="K", help="of a video: k1 k2 p1 p2 [k3 ...]")
     add("--camera-info", type=Path, help="of a video: calibration YAML in the ROS format")
-    add("--depth-scale", type=above_zero, help="stored depth values per metre")
-    add("--rate", type=above_zero, help="frames a second of folders without stamps")
+    add("--depth-scale", type=finite_above_zero, help="stored depth values per metre")
+    add("--rate", type=finite_above_zero, help="frames a second of folders without stamps")
     add("--stride", type=at_least_one, default=1, help="take every N-th frame")
     add("--max-frames", type=at_least_one, help="stop after so many")
     add("--namespace", default="/camera", help="of the topics")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -193,27 +193,26 @@ def _scores(result: Mapping[str, dict[str, float] | None]) -> list[Cell]:
 def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:
     """Per-frame scale (over its median) and error over time, a line per run."""
     rows = {name: run.rows() for name, run in runs.items()}
-    medians = {
-        name: float(np.median([r["scale"] for r in found if r["scale"] is not None] or [1.0]))
-        for name, found in rows.items()
-    }
     return curves(
         {
             "scale that fits each frame, over its median (flat is stable)": {
-                name: [_ratio(r["scale"], medians[name]) for r in found]
-                for name, found in rows.items()
+                name: over_median(column(found, "scale")) for name, found in rows.items()
             },
             "AbsRel, one alignment for the sequence (video protocol)": {
-                name: [_number(r["video_abs_rel"]) for r in found] for name, found in rows.items()
+                name: column(found, "video_abs_rel") for name, found in rows.items()
             },
         }
     )
 
 
-def _number(cell: Cell) -> float | None:
-    return float(cell) if isinstance(cell, (int, float)) else None
+def column(rows: Sequence[Mapping[str, Cell]], name: str) -> list[float | None]:
+    """The numbers of one of COLUMNS, None where there is none."""
+    cells = [row[name] for row in rows]
+    return [float(cell) if isinstance(cell, (int, float)) else None for cell in cells]
 
 
-def _ratio(cell: Cell, by: float) -> float | None:
-    value = _number(cell)
-    return None if value is None or by == 0 else value / by
+def over_median(values: Sequence[float | None]) -> list[float | None]:
+    """Values over the median of those that are known; all None when that is 0 or nothing is."""
+    known = [value for value in values if value is not None]
+    middle = float(np.median(known)) if known else 0.0
+    return [None if value is None or middle == 0 else value / middle for value in values]

@@ -18,7 +18,12 @@ from dyfn_core.evaluation.report import (
     Table,
     Text,
 )
-from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
+from dyfn_core.evaluation.sequence import (
+    SequenceEvaluation,
+    column,
+    over_median,
+    score_table,
+)
 
 SCORE_NOTE = (
     "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
@@ -79,10 +84,10 @@ def _key_figures(result: Mapping[str, Any]) -> KeyFigures:
 def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
     rows = {name: run.rows() for name, run in runs.items()}
 
-    def lines(column: str) -> dict[str, list[float | None]]:
-        return {name: [_number(row[column]) for row in found] for name, found in rows.items()}
+    def lines(name_of_column: str) -> dict[str, list[float | None]]:
+        return {name: column(found, name_of_column) for name, found in rows.items()}
 
-    scale = {name: _over_median(values) for name, values in lines("scale").items()}
+    scale = {name: over_median(values) for name, values in lines("scale").items()}
     if not any(value is not None for values in scale.values() for value in values):
         return []
     parts: list[Part] = [
@@ -94,31 +99,20 @@ def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
     return [Section("Over time", parts)]
 
 
-def _over_median(values: list[float | None]) -> list[float | None]:
-    known = [value for value in values if value is not None]
-    middle = float(np.median(known)) if known else 0.0
-    return [None if value is None or middle == 0 else value / middle for value in values]
-
-
-def _number(cell: Cell) -> float | None:
-    return float(cell) if isinstance(cell, (int, float)) else None
-
-
 def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
     video = run.video()
     if video is None:
         return []
     rows = run.rows()
-    errors = [_number(row["video_abs_rel"]) for row in rows]
+    errors, stamps = column(rows, "video_abs_rel"), column(rows, "stamp")
     table: list[list[Cell]] = []
     shown = []
     for index in run.worst.choose(errors):
         found = run.worst.nearest(index, errors)
         if found is not None:
             shown.append(found)
-        stamp = _number(rows[index]["stamp"])
         picture = "not kept" if found is None else f"frame {found.index}"
-        table.append([f"frame {index}", f"{stamp:.3f}", errors[index], picture])
+        table.append([f"frame {index}", f"{stamps[index]:.3f}", errors[index], picture])
     header = ("worst first", "stamp, s", "AbsRel", "picture")
     parts: list[Part] = [Table(header, table), Text(WORST_NOTE, note=True)]
     if shown:
@@ -132,7 +126,7 @@ def _latency(runs: Mapping[str, SequenceEvaluation]) -> Section:
         [name, *(f"{value:.1f}" for value in found.values())] for name, found in marks.items()
     ]
     values = {
-        name: [value for row in run.rows() if (value := _number(row["latency_ms"])) is not None]
+        name: [value for value in column(run.rows(), "latency_ms") if value is not None]
         for name, run in runs.items()
     }
     histogram = Histogram("Time per frame", values, "ms", marks)
