@@ -3,6 +3,7 @@
 import json
 import resource
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -193,24 +194,29 @@ def test_rerun_that_is_missing_is_named(
     assert "with its `rerun` extra" in capsys.readouterr().err
 
 
-@pytest.fixture
-def small_files() -> Iterator[Callable[[int], None]]:
-    """Takes the size that no file may exceed, as if the disk were full."""
+@contextmanager
+def small_files(size: int) -> Iterator[None]:
+    """No file may exceed so many bytes, as if the disk were full.
+
+    Not a fixture: its end would come after pytest's own line about the test, which a log of that
+    size refuses as well.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name != "rrd"])
 def test_a_full_disk_leaves_no_half_file(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    small_files: Callable[[int], None],
-    name: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     arguments = noisy_walk(tmp_path)
-    small_files(20_000)
-    assert main([*arguments, "--write", name], load_tiny) == UNUSABLE
+    with small_files(20_000):
+        code = main([*arguments, "--write", name], load_tiny)
+    assert code == UNUSABLE
     assert "cannot be written" in capsys.readouterr().err
     assert list((tmp_path / "out").iterdir()) == []
 
