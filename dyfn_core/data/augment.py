@@ -17,7 +17,9 @@ class Look:
     colour: 3 x 3 on RGB in 0..1. gain, offset: per channel. gamma: exponent. blur: Gaussian sigma
     in pixels. motion: blur kernel or None. light: coarse field of gains. vignette: loss at the
     corners. noise: (shot, read) deviations. coarse: factor of a down- and upsampling.
-    jpeg: quality or None. seed: of the noise.
+    jpeg: quality or None. seed: of the noise. bloom: share of the brightest light that is spread
+    around it. local: strength of a local tone mapping. sharpen: of an unsharp mask, which leaves
+    halos.
     """
 
     colour: np.ndarray
@@ -32,6 +34,9 @@ class Look:
     coarse: float
     jpeg: int | None
     seed: int
+    bloom: float = 0.0
+    local: float = 0.0
+    sharpen: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -126,6 +131,9 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
         coarse=float(rng.uniform(1.3, 2.5)) if happens(0.2) else 1.0,
         jpeg=int(rng.integers(20, 95)) if happens(0.5) else None,
         seed=int(rng.integers(2**31)),
+        bloom=float(rng.uniform(0.1, 0.7)) if happens(0.25) else 0.0,
+        local=float(rng.uniform(0.1, 0.6)) if happens(0.3) else 0.0,
+        sharpen=float(rng.uniform(0.3, 2.0)) if happens(0.4) else 0.0,
     )
 
 
@@ -141,6 +149,11 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
     pixels: np.ndarray = image.astype(np.float32) / 255
     if look.light is not None:
         pixels *= cv2.resize(look.light, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
+    if look.bloom > 0:
+        pixels = pixels + look.bloom * 3 * _smooth(np.clip(pixels - 0.85, 0, None))
+    if look.local > 0:
+        level = _smooth(pixels).mean(axis=2, keepdims=True) + 0.05
+        pixels = pixels * (level / level.mean()) ** -look.local
     matrix = look.colour * look.gain[:, None]
     pixels = cv2.transform(pixels, np.hstack([matrix, look.offset[:, None]]))
     if look.vignette > 0:
@@ -151,6 +164,8 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
         pixels = cv2.GaussianBlur(pixels, (0, 0), look.blur * width / 256 + 0.2)
     if look.motion is not None:
         pixels = cv2.filter2D(pixels, -1, look.motion)
+    if look.sharpen > 0:
+        pixels = pixels + look.sharpen * (pixels - cv2.GaussianBlur(pixels, (0, 0), 1.0))
     pixels = np.clip(pixels, 0, 1)
     if look.gamma != 1:
         pixels = cv2.pow(pixels, look.gamma)
@@ -165,6 +180,13 @@ def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
         _, data = cv2.imencode(".jpg", result, [cv2.IMWRITE_JPEG_QUALITY, look.jpeg])
         return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR))
     return result
+
+
+def _smooth(pixels: np.ndarray) -> np.ndarray:
+    """A wide blur, by way of a small image."""
+    height, width = pixels.shape[:2]
+    small = cv2.resize(pixels, (24, 24), interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), 1.0), (width, height))
 
 
 def _colour_matrix(hue: float, saturation: float) -> np.ndarray:

@@ -119,7 +119,7 @@ def random_view(
 
     interests: N x 3; half the time one of them is looked at from 0.6 to 4 m.
     """
-    if len(interests) and rng.random() < 0.55:
+    if len(interests) and rng.random() < 0.65:
         camera = _view_of(space, rng, lens, interests[rng.integers(len(interests))])
         if camera is not None:
             return camera

@@ -12,6 +12,7 @@ import numpy as np
 from dyfn_core.data.worlds import vary as variation
 from dyfn_core.data.worlds.casting import Cast
 from dyfn_core.data.worlds.furniture import Showroom
+from dyfn_core.data.worlds.palette import Palette
 from dyfn_core.data.worlds.photographer import Photographer
 from dyfn_core.data.worlds.quake import GameFiles, MapError, load_map
 from dyfn_core.data.worlds.renderer import Renderer
@@ -78,11 +79,11 @@ class RoomWorlds:
         self.showroom = Showroom(libraries) if libraries else None
         archives = sorted(assets.rglob("*.pk3"))
         maps = MapWorlds(assets) if archives else None
-        self.pool = maps.pool if maps else []
+        self.palette = Palette.find(assets, maps.pool if maps else [])
         self.cast = Cast(maps.files if maps else None, self.showroom)
 
     def scene(self, rng: np.random.Generator, held_out: bool) -> Scene:
-        scene = furnished_room(rng, self.showroom, self.pool)
+        scene = furnished_room(rng, self.showroom, self.palette)
         self.cast.join(scene, rng)
         return scene
 

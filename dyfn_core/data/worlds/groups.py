@@ -116,11 +116,13 @@ def cupboards(room: Room) -> None:
     place = _find(room, count * width, deep, wall=0.97)
     if place is None:
         return
-    front = place.layer(textures.wood(rng) if rng.random() < 0.4 else textures.paint(rng))
+    wooden = textures.wood if rng.random() < 0.4 else textures.paint
+    front = place.layer(room.palette.surface(rng, wooden))
     dark = float(rng.choice([1.0, 1.0, 0.06, 0.3]))
     color = np.full(3, dark, np.float32)
     metal = place.layer(np.full((4, 4, 3), 190, np.uint8))
-    top = place.layer(textures.wood(rng) if rng.random() < 0.5 else textures.paint(rng))
+    board = textures.wood if rng.random() < 0.5 else textures.paint
+    top = place.layer(room.palette.surface(rng, board))
     for index in range(count):
         x = (index - (count - 1) / 2) * width
         place.box(x, 0.01, 0.06, (width, deep - 0.02, high - 0.09), front, color * 0.8)
@@ -186,7 +188,7 @@ def table(base: Spot, width: float, deep: float, high: float, look: tuple[int, i
 
 def _table_look(room: Room) -> tuple[int, int, int]:
     rng, here = room.rng, spot(room, 0, 0, 0)
-    top = textures.wood(rng) if rng.random() < 0.55 else textures.paint(rng)
+    top = room.palette.surface(rng, textures.wood if rng.random() < 0.55 else textures.paint)
     legs = np.full((4, 4, 3), int(rng.choice([25, 120, 200, 240])), np.uint8)
     layer = here.layer(top)
     return layer, layer if rng.random() < 0.3 else here.layer(legs), int(rng.integers(3))

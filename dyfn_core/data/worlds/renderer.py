@@ -25,6 +25,18 @@ from dyfn_core.data.worlds.shaders import (
 )
 
 NEAR = 0.05
+MIRROR_SIZE = 128
+BRIGHTEST = 60.0
+NO_PANE = [0.0, 0.0, 0.0, -1.0]
+# camera axes (right, down, forward) of the faces +x, -x, +y, -y, +z, -z as OpenGL samples them
+CUBE_FACES = (
+    ((0, 0, -1), (0, -1, 0), (1, 0, 0)),
+    ((0, 0, 1), (0, -1, 0), (-1, 0, 0)),
+    ((1, 0, 0), (0, 0, 1), (0, 1, 0)),
+    ((1, 0, 0), (0, 0, -1), (0, -1, 0)),
+    ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    ((-1, 0, 0), (0, -1, 0), (0, 0, -1)),
+)
 ACTOR_ALPHA = 128  # of 255: where an actor covers the pixel; the static scene has 255
 
 VERTEX_FORMAT = "3f 3f 2f 3f 2f 1i 1i 1f"
@@ -54,7 +66,8 @@ class Camera:
 
 @dataclass(frozen=True)
 class Look:
-    """How radiance becomes a picture. gloss: strength of highlights; contrast: 0 (soft) to 1."""
+    """How radiance becomes a picture. gloss: strength of highlights and reflections; contrast: 0
+    (soft) to 1."""
 
     exposure: float = 1.0
     gloss: float = 0.2
@@ -150,9 +163,11 @@ class Renderer:
         self._set_lights(self._lights)
         self._actors = [_ActorMesh(self, actor) for actor in scene.actors]
         self._placed = ()
+        surroundings = self._look_around(scene)
         self._scene_objects = [
             vertices, indices, *self.meshes, textures, lightmaps, shadows, target,
-            actor_shadows, self._actor_target, *(o for a in self._actors for o in a.objects()),
+            surroundings, actor_shadows, self._actor_target,
+            *(o for a in self._actors for o in a.objects()),
         ]  # fmt: skip
 
     def draw(
@@ -233,6 +248,49 @@ class Renderer:
         layers = np.stack(images) if images else np.zeros((1, size, size, 3), np.uint8)
         return self.ctx.texture_array((size, size, len(layers)), 3, layers.tobytes(), alignment=1)
 
+    def _look_around(self, scene: Scene) -> Any:
+        """A cube map of the scene's own light, seen from the middle; later draws mirror it.
+
+        Scenes with baked light mirror nothing.
+        """
+        cube = self.ctx.texture_cube((MIRROR_SIZE, MIRROR_SIZE), 3, dtype="f2")
+        cube.use(4)
+        self.program["surroundings"] = 4
+        self.program["mirrored"] = 0.0
+        corners = scene.vertices["position"]
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        probe = (low + high) / 2
+        self.program["probe"] = tuple(probe.tolist())
+        self.program["box_low"], self.program["box_high"] = (
+            tuple(low.tolist()),
+            tuple(high.tolist()),
+        )
+        if scene.lightmaps:
+            return cube
+        shape = (MIRROR_SIZE, MIRROR_SIZE)
+        target: Any = self.ctx.framebuffer(
+            [self.ctx.texture(shape, 4, dtype="f2"), self.ctx.texture(shape, 1, dtype="f4")],
+            self.ctx.depth_renderbuffer(shape),
+        )
+        self.program["raw"] = True
+        self._set_moment(STILL)
+        for face, axes in enumerate(CUBE_FACES):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = np.array(axes, float).T, probe
+            self._set_camera(Camera(pose, (0.5, 0.5)), Look(gloss=0.0))
+            target.use()
+            target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
+            self._render(0, STILL)
+            # a degenerate triangle's NaN would spread over the coarse levels
+            seen = np.frombuffer(target.read(components=3, dtype="f2"), np.float16)
+            cube.write(face, np.clip(np.nan_to_num(seen), 0, BRIGHTEST).astype("f2").tobytes())
+        target.release()
+        self.program["raw"] = False
+        cube.build_mipmaps()
+        cube.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        self.program["mirrored"] = 1.0
+        return cube
+
     def _atlas(self, size: int) -> tuple[Any, Any]:
         """A 2 x 2 atlas of shadow maps, and the framebuffer that draws into it."""
         atlas = self.ctx.depth_texture((2 * size, 2 * size))
@@ -258,7 +316,11 @@ class Renderer:
         for name, values in {
             "light_position": [x.position for x in padded],
             "light_direction": [x.direction for x in padded],
-            "light_cosine": [np.cos(np.radians(x.cone_degrees / 2)) for x in padded],
+            # a window cuts its light itself
+            "light_cosine": [-2.0 if x.window else _cosine(x) for x in padded],
+            "pane_centre": [[*w.centre, w.bars] if (w := x.window) else NO_PANE for x in padded],
+            "pane_right": [w.right if (w := x.window) else NO_PANE[:3] for x in padded],
+            "pane_up": [w.up if (w := x.window) else NO_PANE[:3] for x in padded],
         }.items():
             program[name].write(np.asarray(values, "f4").tobytes())
 
@@ -273,6 +335,10 @@ def _padded(lights: list[Light]) -> list[Light]:
     return [*lights, *[dark] * MAX_LIGHTS][:MAX_LIGHTS]
 
 
+def _cosine(light: Light) -> float:
+    return float(np.cos(np.radians(light.cone_degrees / 2)))
+
+
 def _column_major(matrix: np.ndarray) -> bytes:
     return matrix.T.astype("f4").tobytes()
 
@@ -285,14 +351,14 @@ def _view_matrix(pose: np.ndarray) -> np.ndarray:
     return view
 
 
-def _projection_matrix(camera: Camera, far: float = 2000.0) -> np.ndarray:
+def _projection_matrix(camera: Camera, far: float = 2000.0, near: float = NEAR) -> np.ndarray:
     """Optical axes to clip space; v grows with GL's y, so that row 0 is the image's top."""
     (fx, fy), (cx, cy) = camera.focal, camera.centre
     return np.array(
         [
             [2 * fx, 0, 2 * cx - 1, 0],
             [0, 2 * fy, 2 * cy - 1, 0],
-            [0, 0, (far + NEAR) / (far - NEAR), -2 * far * NEAR / (far - NEAR)],
+            [0, 0, (far + near) / (far - near), -2 * far * near / (far - near)],
             [0, 0, 1, 0],
         ]
     )
@@ -306,4 +372,7 @@ def _light_matrix(light: Light) -> np.ndarray:
     pose[:3, :3] = np.stack([side, np.cross(forward, side), forward], axis=1)
     pose[:3, 3] = light.position
     focal = 0.5 / np.tan(np.radians(min(light.cone_degrees, 150.0) / 2))
-    return _projection_matrix(Camera(pose, (focal, focal)), far=40.0) @ _view_matrix(pose)
+    near = NEAR
+    if light.window is not None:
+        near += float(((light.window.corners() - light.position) @ forward).max())
+    return _projection_matrix(Camera(pose, (focal, focal)), 40.0, near) @ _view_matrix(pose)

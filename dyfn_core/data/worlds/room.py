@@ -9,23 +9,26 @@ import numpy as np
 
 from dyfn_core.data.worlds import textures
 from dyfn_core.data.worlds.furniture import Piece, Showroom
-from dyfn_core.data.worlds.scene import SceneBuilder
+from dyfn_core.data.worlds.palette import Palette
+from dyfn_core.data.worlds.scene import SceneBuilder, Window
 
 
 @dataclass
 class Room:
     """One box of a room while it is being filled. size: (x, y, z) metres from the origin.
 
-    taken: footprints (centre, half sizes). interests: points that people look at.
+    taken: footprints (centre, half sizes). interests: points that people look at. windows: in the
+    walls, facing inwards.
     """
 
     rng: np.random.Generator
     size: np.ndarray
     showroom: Showroom | None = None
-    pool: list[np.ndarray] = field(default_factory=list)
+    palette: Palette = field(default_factory=Palette)
     builder: SceneBuilder = field(default_factory=SceneBuilder)
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
     interests: list[np.ndarray] = field(default_factory=list)
+    windows: list[Window] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._style = int(self.rng.integers(1 << 30))
@@ -72,8 +75,7 @@ class Room:
         images = {}
         for index, part in enumerate(self.showroom.parts(piece)):
             if rng.random() < (0.06 if part.image is not None else 0.25):
-                own = bool(self.pool) and rng.random() < 0.1
                 draw = (textures.cloth, textures.wood, textures.paint)[rng.integers(3)]
-                images[index] = self.pool[rng.integers(len(self.pool))] if own else draw(rng)
+                images[index] = self.palette.surface(rng, draw)
         tint = np.clip(rng.lognormal(0.0, 0.35) * rng.normal(1, 0.05, 3), 0.1, 2.0)
         return self.showroom.place(self.builder, piece, position, yaw, tint, images)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 
 from dyfn_core.data.worlds import clutter, groups, textures
 from dyfn_core.data.worlds.furniture import Piece, Showroom
+from dyfn_core.data.worlds.palette import Palette
 from dyfn_core.data.worlds.room import Room
-from dyfn_core.data.worlds.scene import Light, Scene
+from dyfn_core.data.worlds.scene import Light, Scene, Window
 
 TOPS = re.compile(
     r"table|desk|cabinet|counter|chest|dresser|drawer|console|nightstand|sideboard|bookcase|shel|"
     r"stool|fridge|oven|washer|worktop|buffet",
     re.IGNORECASE,
 )
+SUN_DISTANCE = 15.0
 CHANCES = {
     "office": 0.42, "living": 0.18, "kitchen": 0.16, "bedroom": 0.09, "bathroom": 0.05,
     "storage": 0.1,
@@ -31,17 +34,18 @@ KINDS: dict[str, tuple[str, ...]] = {
 
 
 def furnished_room(
-    rng: np.random.Generator, showroom: Showroom | None, pool: list[np.ndarray]
+    rng: np.random.Generator, showroom: Showroom | None, palette: Palette | None = None
 ) -> Scene:
     """A random room. Without a showroom it holds only boxes and pictures (own procedural art).
 
-    pool: images for posters, boxes and some surfaces; may be empty.
+    palette: what surfaces, posters and windows show; own procedural art without one.
     """
     large = rng.random() < 0.4
     size = rng.uniform([2.6, 2.8, 2.35], [8.5, 11.0, 3.6] if large else [5.2, 6.5, 2.9])
-    room = Room(rng, size, showroom, pool)
-    lights = _lights(room)
-    _shell(room, pool)
+    room = Room(rng, size, showroom, palette or Palette())
+    lights = _lamps(room)
+    _shell(room)
+    lights += _daylight(room)
     if rng.random() < 0.3:
         _partition(room)
     kind = str(rng.choice(list(CHANCES), p=list(CHANCES.values())))
@@ -50,7 +54,7 @@ def furnished_room(
     _groups(room, kind)
     if showroom is not None:
         _furnish(room, showroom, kind)
-    _boxes(room, pool, int(rng.poisson(1.5 if showroom else 6)))
+    _boxes(room, int(rng.poisson(1.5 if showroom else 6)))
     return room.builder.build(
         lights=lights,
         ambient=(rng.uniform(0.15, 0.6) * (0.88 + 0.24 * rng.random(3))).astype(np.float32),
@@ -83,54 +87,45 @@ def _groups(room: Room, kind: str) -> None:
         groups.big_plant(room)
 
 
-def _image(rng: np.random.Generator, pool: list[np.ndarray], share: float) -> np.ndarray:
-    if pool and rng.random() < share:
-        return pool[rng.integers(len(pool))]
-    return textures.picture(rng) if rng.random() < 0.7 else textures.books(rng)
-
-
-def _surface(room: Room, pool: list[np.ndarray], kind: str) -> int:
-    rng = room.rng
+def _surface(room: Room, kind: str) -> int:
+    rng, palette = room.rng, room.palette
     chance = rng.random()
     if kind == "wall":
-        painted = textures.plaster(rng) if chance < 0.75 else textures.material(rng)
-        image = textures.paint(rng) if chance < 0.6 else painted
+        rough = textures.plaster if chance < 0.75 else textures.material
+        image = textures.paint(rng) if chance < 0.5 else palette.surface(rng, rough)
     elif kind == "ceiling":
         image = textures.paint(rng) if chance < 0.75 else textures.tiles(rng)
         image = (255 - (255 - image.astype(np.float32)) * 0.4).astype(np.uint8)
     else:
-        image = textures.material(rng)
-        if chance < 0.75:
-            image = textures.carpet(rng) if chance < 0.4 else textures.wood(rng)
-    if pool and rng.random() < 0.04:
-        image = pool[rng.integers(len(pool))]
+        usual = textures.carpet if chance < 0.4 else textures.wood
+        image = palette.surface(rng, usual if chance < 0.75 else textures.material)
     return room.builder.texture((kind, int(rng.integers(1 << 30))), image)
 
 
-def _shell(room: Room, pool: list[np.ndarray]) -> None:
+def _shell(room: Room) -> None:
     rng, build, (x, y, z) = room.rng, room.builder, room.size
-    floor, ceiling = _surface(room, pool, "floor"), _surface(room, pool, "ceiling")
+    floor, ceiling = _surface(room, "floor"), _surface(room, "ceiling")
     repeat = float(rng.uniform(0.5, 2.5))
     build.quad(
         np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]]), floor, (x / repeat, y / repeat)
     )
     if rng.random() < 0.3:  # another floor in a part of the room
-        part, other = rng.uniform(0.25, 0.75), _surface(room, pool, "floor")
+        part, other = rng.uniform(0.25, 0.75), _surface(room, "floor")
         a, b = (part * x, y) if rng.random() < 0.5 else (x, part * y)
         corners = np.array([[0, 0, 0.002], [a, 0, 0.002], [a, b, 0.002], [0, b, 0.002]])
         build.quad(corners, other, (a / repeat, b / repeat))
     build.quad(np.array([[0, y, z], [x, y, z], [x, 0, z], [0, 0, z]]), ceiling, (x / 1.2, y / 1.2))
     corners = np.array([[0, 0], [x, 0], [x, y], [0, y]])
-    wall = _surface(room, pool, "wall")
+    wall = _surface(room, "wall")
     for side in range(4):
         a, b = corners[side], corners[(side + 1) % 4]
-        layer = _surface(room, pool, "wall") if rng.random() < 0.2 else wall
+        layer = _surface(room, "wall") if rng.random() < 0.2 else wall
         length = float(np.linalg.norm(b - a))
         build.quad(np.array([[*b, 0], [*a, 0], [*a, z], [*b, z]]), layer, (length / 2.0, z / 2.0))
-        _hang(room, a, b, pool)
+        _hang(room, a, b)
 
 
-def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> None:
+def _hang(room: Room, a: np.ndarray, b: np.ndarray) -> None:
     """Windows, posters, boards, a skirting board on the wall from a to b (inside on its left)."""
     rng, build, height = room.rng, room.builder, room.size[2]
     along = (b - a) / np.linalg.norm(b - a)
@@ -150,12 +145,20 @@ def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> N
         count, low = int(rng.integers(1, 4)), rng.uniform(0.1, 1.1)
         width = min(rng.uniform(0.6, 1.8), 0.8 * length / count)
         frame = build.texture("frame", textures.plaster(rng))
-        view = build.texture(("window", id(rng)), textures.window(rng))
+        view = build.texture(("window", id(rng)), room.palette.outdoors(rng))
         high, glow = min(low + rng.uniform(0.8, 1.8), height - 0.1), rng.uniform(0.5, 5.0)
         for i in range(count):
             start = length * (i + 0.5) / count - width / 2
             panel(start - 0.06, width + 0.12, low - 0.06, high + 0.06, frame, 0.02, 0)
             panel(start, width, low, high, view, 0.025, glow)
+            middle = a + along * (start + width / 2) + inward * 0.025
+            room.windows.append(
+                Window(
+                    np.array([*middle, (low + high) / 2]),
+                    np.array([*(along * width / 2), 0.0]),
+                    np.array([0.0, 0.0, (high - low) / 2]),
+                )
+            )
             _cross(room, a + along * start, along * width, inward, low, high, frame)
         if rng.random() < 0.4:
             _curtains(room, a, along, inward, (length, width * count, high + 0.1))
@@ -167,9 +170,9 @@ def _hang(room: Room, a: np.ndarray, b: np.ndarray, pool: list[np.ndarray]) -> N
               0.03, 0)  # fmt: skip
         return
     for _ in range(int(rng.poisson(1.2))):
-        width, tall = rng.uniform(0.2, min(1.6, 0.8 * length)), rng.uniform(0.2, 1.1)
-        low = rng.uniform(0.7, max(height - tall - 0.1, 0.8))
-        layer = build.texture(("hung", int(rng.integers(1 << 30))), _image(rng, pool, 0.6))
+        width, tall = rng.uniform(0.2, min(1.6, 0.8 * length)), rng.uniform(0.2, 1.6)
+        low = rng.uniform(0.4, max(height - tall - 0.1, 0.5))
+        layer = build.texture(("hung", int(rng.integers(1 << 30))), room.palette.picture(rng))
         start, off = rng.uniform(0, length - width), rng.uniform(0.01, 0.05)
         panel(start, width, low, low + tall, layer, off, rng.choice([0, 0, 0, 1.5]))
 
@@ -206,7 +209,7 @@ def _curtains(
 def _partition(room: Room) -> None:
     """A wall, half-high screen or pillar that stands in the room."""
     rng, (x, y, z) = room.rng, room.size
-    layer = room.builder.texture("partition", textures.material(rng))
+    layer = room.builder.texture("partition", room.palette.surface(rng, textures.material))
     for _ in range(int(rng.integers(1, 3))):
         high = z if rng.random() < 0.5 else rng.uniform(1.0, 1.8)
         across = rng.random() < 0.5
@@ -268,7 +271,7 @@ def _stand(room: Room, piece: Piece, small: list[Piece]) -> None:
             room.put(item, spot, yaw + rng.normal(0, 0.6))
 
 
-def _boxes(room: Room, pool: list[np.ndarray], count: int) -> None:
+def _boxes(room: Room, count: int) -> None:
     """Cartons, books, plinths: boxes on the floor, some stacked."""
     rng = room.rng
     for _ in range(count):
@@ -282,7 +285,9 @@ def _boxes(room: Room, pool: list[np.ndarray], count: int) -> None:
             high = base + float(rng.uniform(0.08, 0.9))
             if high > room.size[2] - 0.5:
                 break
-            image = textures.material(rng) if rng.random() < 0.6 else _image(rng, pool, 0.5)
+            palette = room.palette
+            plain = rng.random() < 0.6
+            image = palette.surface(rng, textures.material) if plain else palette.picture(rng)
             layer = room.builder.texture(("box", int(rng.integers(1 << 30))), image)
             low = np.array([x - half[0], y - half[1], base])
             top = np.array([x + half[0], y + half[1], high])
@@ -301,11 +306,11 @@ def _lamp(room: Room, below: np.ndarray) -> None:
     room.builder.quad(np.array(corners), glow, emission=float(rng.uniform(3, 9)))
 
 
-def _lights(room: Room) -> list[Light]:
-    """One to three lamps under the ceiling, and perhaps the sun through a window."""
+def _lamps(room: Room) -> list[Light]:
+    """One or two lamps under the ceiling."""
     rng, size = room.rng, room.size
     lights = []
-    for _ in range(int(rng.integers(1, 4))):
+    for _ in range(int(rng.integers(1, 3))):
         position = np.array(
             [*rng.uniform(0.2, 0.8, 2) * size[:2], size[2] - rng.uniform(0.05, 0.4)]
         )
@@ -314,7 +319,16 @@ def _lights(room: Room) -> list[Light]:
         warm = np.array([1.0, rng.uniform(0.85, 1.0), rng.uniform(0.65, 1.05)])
         color, cone = warm * rng.uniform(1.5, 7.0), float(rng.uniform(120, 170))
         lights.append(Light(position, direction / np.linalg.norm(direction), color, cone))
-    if rng.random() < 0.5:
+    return lights
+
+
+def _daylight(room: Room) -> list[Light]:
+    """The sky's light through one window or, without one, from somewhere; perhaps the sun."""
+    rng, size = room.rng, room.size
+    lights = []
+    if room.windows and rng.random() < 0.75:
+        lights.append(_sky(rng, room.windows[rng.integers(len(room.windows))]))
+    elif rng.random() < 0.3:
         side = rng.integers(4)
         edge = [(0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98)][side]
         position = np.array([*np.array(edge) * size[:2], rng.uniform(1.2, 2.2)])
@@ -323,4 +337,32 @@ def _lights(room: Room) -> list[Light]:
         lights.append(
             Light(position, aim / np.linalg.norm(aim), color, float(rng.uniform(60, 140)))
         )
+    if room.windows and rng.random() < 0.5:
+        lights.append(_sun(rng, room.windows[rng.integers(len(room.windows))]))
     return lights
+
+
+def _sky(rng: np.random.Generator, window: Window) -> Light:
+    """A soft cone from the window into the room, a little downwards."""
+    inward = np.cross(window.up, window.right)
+    inward = inward / np.linalg.norm(inward)
+    aim = inward + np.array([*rng.normal(0, 0.25, 2), -rng.uniform(0.1, 0.6)])
+    color = np.array([0.92, 1.0, rng.uniform(1.0, 1.2)]) * rng.uniform(2, 12)
+    position = window.centre + 0.08 * inward
+    return Light(position, aim / np.linalg.norm(aim), color, float(rng.uniform(120, 165)))
+
+
+def _sun(rng: np.random.Generator, window: Window) -> Light:
+    """A patch of sunlight: a far lamp whose light comes through one window."""
+    inward = np.cross(window.up, window.right)
+    inward = inward / np.linalg.norm(inward)
+    side = window.right / np.linalg.norm(window.right)
+    across, height = np.radians(rng.uniform(-55, 55)), np.radians(rng.uniform(12, 55))
+    level = np.cos(across) * inward + np.sin(across) * side
+    way = np.cos(height) * level - np.array([0.0, 0.0, np.sin(height)])
+    color = np.array([1.0, rng.uniform(0.85, 0.98), rng.uniform(0.65, 0.92)])
+    color = color * rng.uniform(2.0, 9.0) * SUN_DISTANCE**2
+    reach = np.linalg.norm(window.right + window.up)
+    cone = 2 * np.degrees(np.arctan(1.1 * reach / SUN_DISTANCE))
+    bars = replace(window, bars=int(rng.integers(0, 3)))
+    return Light(window.centre - SUN_DISTANCE * way, way, color, float(cone), bars)

@@ -30,13 +30,32 @@ VERTEX_DTYPE = np.dtype(
 
 
 @dataclass(frozen=True)
+class Window:
+    """A rectangle in a wall: centre +- right +- up, in metres. bars: of its frame, each way."""
+
+    centre: np.ndarray
+    right: np.ndarray
+    up: np.ndarray
+    bars: int = 1
+
+    def corners(self) -> np.ndarray:
+        """4 x 3."""
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        return self.centre + signs[:, :1] * self.right + signs[:, 1:] * self.up
+
+
+@dataclass(frozen=True)
 class Light:
-    """A spot light that casts shadows. position in metres, color linear RGB radiance at 1 m."""
+    """A spot light that casts shadows. position in metres, color linear RGB radiance at 1 m.
+
+    window: the light shines through it alone, and what stands before it casts no shadow.
+    """
 
     position: np.ndarray
     direction: np.ndarray
     color: np.ndarray
     cone_degrees: float = 120.0
+    window: Window | None = None
 
 
 @dataclass

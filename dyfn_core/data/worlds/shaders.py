@@ -34,6 +34,10 @@ uniform float contrast; uniform float alpha; uniform float baked; uniform float 
 uniform int light_count; uniform mat4 light_matrix[MAX_LIGHTS];
 uniform vec3 light_position[MAX_LIGHTS]; uniform vec3 light_direction[MAX_LIGHTS];
 uniform vec3 light_color[MAX_LIGHTS]; uniform float light_cosine[MAX_LIGHTS];
+uniform vec4 pane_centre[MAX_LIGHTS];  // w: bars across each pane; below 0 without a window
+uniform vec3 pane_right[MAX_LIGHTS]; uniform vec3 pane_up[MAX_LIGHTS];
+uniform samplerCube surroundings; uniform vec3 probe; uniform vec3 box_low; uniform vec3 box_high;
+uniform float mirrored; uniform bool raw;
 in vec3 position; in vec3 normal; in vec2 uv; in vec3 color; in vec2 lightmap_uv;
 in float depth; in float emission; flat in int layer; flat in int lightmap;
 layout(location = 0) out vec4 out_color; layout(location = 1) out float out_depth;
@@ -57,6 +61,26 @@ float lit_share(int i, vec3 n) {
     return sum / 4.0;
 }
 
+float through_window(int i) {
+    // 1 where the way from the light goes through its window and past the window's bars
+    if (pane_centre[i].w < 0.0) return 1.0;
+    vec3 right = pane_right[i]; vec3 up = pane_up[i]; vec3 plane = cross(right, up);
+    vec3 way = position - light_position[i];
+    float t = dot(pane_centre[i].xyz - light_position[i], plane) / dot(way, plane);
+    vec3 at = light_position[i] + t * way - pane_centre[i].xyz;
+    vec2 q = vec2(dot(at, right) / dot(right, right), dot(at, up) / dot(up, up));
+    if (t <= 0.0 || any(greaterThan(abs(q), vec2(1.0)))) return 0.0;
+    vec2 bars = abs(fract(0.5 * (q + 1.0) * (pane_centre[i].w + 1.0) + 0.5) - 0.5);
+    return pane_centre[i].w > 0.0 && min(bars.x, bars.y) < 0.05 ? 0.0 : 1.0;
+}
+
+vec3 reflected(vec3 way, float blur) {
+    // what the room's own picture, taken at the probe, shows where this ray meets the room's box
+    vec3 ends = (mix(box_low, box_high, step(0.0, way)) - position) / way;
+    float t = max(min(min(ends.x, ends.y), ends.z), 0.0);
+    return textureLod(surroundings, position + t * way - probe, blur).rgb;
+}
+
 void main() {
     vec3 albedo = texture(textures, vec3(uv, layer)).rgb;
     albedo *= albedo * color;
@@ -68,12 +92,14 @@ void main() {
         light = baked * (2.5 * light * light + 0.8 * light) + ambient * 0.4;
     } else {
         light = ambient * (0.75 + 0.25 * n.z) + key * max(dot(n, vec3(0.4, 0.3, 0.866)), 0.0);
+        if (mirrored > 0.0) light = 0.45 * light + 0.8 * textureLod(surroundings, n, 5.0).rgb;
         float shiny = gloss * fract(float(layer) * 0.618);
         for (int i = 0; i < light_count; i++) {
             vec3 l = light_position[i] - position; float d2 = dot(l, l); l *= inversesqrt(d2);
             float aim = -dot(l, light_direction[i]);
             float cone = smoothstep(light_cosine[i], light_cosine[i] + 0.35, aim);
             float facing = max(dot(n, l), 0.0);
+            cone *= through_window(i);
             if (cone * facing <= 0.0) continue;
             vec3 incoming = light_color[i] * cone * lit_share(i, n) / (0.5 + d2);
             light += incoming * facing;
@@ -82,7 +108,18 @@ void main() {
             shine += incoming * shiny * h;
         }
         float graze = 1.0 - abs(dot(n, to_eye)); graze *= graze; graze *= graze;
-        shine += ambient * shiny * (0.05 + graze);
+        if (mirrored > 0.0) {
+            float blur = 4.0 * fract(float(layer) * 0.3247);
+            float strength = (0.04 + 0.96 * graze) * min(2.0 * shiny, 1.0) * mirrored;
+            shine += strength * reflected(reflect(-to_eye, n), blur);
+        } else {
+            shine += ambient * shiny * (0.05 + graze);
+        }
+    }
+    if (raw) {
+        out_color = vec4(albedo * (light + emission) + shine, 1.0);
+        out_depth = depth;
+        return;
     }
     vec3 radiance = exposure * (albedo * (light + emission) + shine);
     radiance = radiance * (1.0 + radiance / 9.0) / (1.0 + radiance);

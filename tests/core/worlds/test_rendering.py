@@ -28,7 +28,7 @@ def renderer() -> Renderer:
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return furnished_room(np.random.default_rng(3), None, [])
+    return furnished_room(np.random.default_rng(3), None)
 
 
 def rays(camera: Camera) -> np.ndarray:
