@@ -33,7 +33,7 @@ def render(assets: Path, seed: int, count: int) -> list[View]:
     if library is None:
         raise FileNotFoundError(f"{assets}: no {LIBRARY} below it (Debian: sweethome3d-furniture)")
     rng = np.random.default_rng([seed, 0xDE30])
-    scene = furnished_room(rng, Showroom([library]), [])
+    scene = furnished_room(rng, Showroom([library]))
     return Photographer(Renderer(SIZE), scene, rng).clip(count, count / FPS)
 
 
