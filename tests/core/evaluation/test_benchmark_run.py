@@ -17,6 +17,7 @@ from dyfn_core.cli import eval as cli
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate, mean_of
 from dyfn_core.evaluation.benchmark_table import HEADER
 from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Settings, open_benchmark
+from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
 from dyfn_core.evaluation.long_sequence import length_table, long_sequences
 from dyfn_core.evaluation.model_method import ModelMethod, as_array
 from dyfn_core.evaluation.predictions import ArrayMethod
@@ -154,6 +155,26 @@ def test_a_model_runs_as_its_stream_does(tmp_path: Path, pinhole_with_dyfn: Geom
             wanted = as_array(stream.push(frame.image, float(index)))
             np.testing.assert_array_equal(found[name], wanted)
     assert not np.array_equal(found["m + DyFN"], found["m, base"])
+
+
+def test_controls_of_the_latent_are_streams_with_that_stabilizer(
+    tmp_path: Path, pinhole_with_dyfn: GeometryModel
+) -> None:
+    model = pinhole_with_dyfn
+    sequence = open_benchmark("tum", room(tmp_path)).sequences[0]
+    predict = ModelMethod("m", model).open(sequence)
+    found = [predict(i, frame) for i, frame in enumerate(sequence.frames())]
+    channels = model.latent_channels
+    for name, control in {"ema": ema_control(channels), "frozen": frozen_control(channels)}.items():
+        with stabilized_by(model, control):
+            stream = DepthStream(model)
+            for index, frame in enumerate(sequence.frames()):
+                wanted = as_array(stream.push(frame.image, float(index)))
+                np.testing.assert_array_equal(found[index][f"control: {name}"], wanted)
+    last = [found[-1][name] for name in ("control: ema", "control: frozen", "m, base", "m + DyFN")]
+    assert len({array.tobytes() for array in last}) == 4
+    plain = ModelMethod("m", model, stabilize=False, controls=False)  # --no-controls
+    assert plain.variants == ("m, base",)
 
 
 def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
