@@ -66,7 +66,7 @@ def room(count: int, size: tuple[int, int]) -> Iterator[RgbdFrame]:
 def replay(recording: Path, out: Path, options: argparse.Namespace) -> dict[str, float]:
     """In a process of its own; -> frames, peak memory in MB and seconds."""
     outputs = ["mcap", "ply", *(o for o, m in EXTRAS.items() if importlib.util.find_spec(m))]
-    arguments = [str(recording), "--out", str(out), "--model", options.model, "--no-progress"]
+    arguments = [str(recording), "--out", str(out), "--model", options.model]
     arguments += ["--write", ",".join(outputs)]
     if options.num_tokens:
         arguments += ["--num-tokens", str(options.num_tokens)]

@@ -92,7 +92,7 @@ def measured(views: list[View], part: slice, poses: bool = True) -> dict[str, di
         for view, found in list(zip(views, said, strict=True))[part]:
             pose = view.pose if poses else None
             scorer.push(view.image, view.depth, found, MATRIX, pose)
-        return scorer.results({name: (3.0, 0.0, DEPTH) for name in said[0]})
+        return scorer.results(dict.fromkeys(said[0], (3.0, 0.0, DEPTH)))
 
 
 def change(part: slice) -> float:
