@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 
 LENGTHS = (1, 4)  # times --frames
 ROUND = 120  # frames in which the camera is where it was

@@ -10,18 +10,18 @@ import numpy as np
 from dyfn_core.evaluation.protocols import FrameScore, sample_grid
 from dyfn_ros.camera_stream import Geometry
 from dyfn_ros.messages import CLOUD_OFFSETS, CLOUD_STEP, depth_fields, pack_cloud
-from dyfn_ros.recording_writer import (
+from dyfn_ros.recording_writer import RecordingWriter
+from dyfn_ros.recordings import RecordedFrame
+from dyfn_ros.rosbags_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     FLOAT,
     IMAGE,
     POINT_CLOUD,
     TYPES,
-    RecordingWriter,
     camera_info,
     header,
 )
-from dyfn_ros.recordings import RecordedFrame
 
 MAX_POINTS = 20_000
 _FLOAT32 = 7  # sensor_msgs/PointField

@@ -19,8 +19,9 @@ from ros_graph import DEADLINE, own_domain
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.messages import decode_depth
 from dyfn_ros.node_process import NodeProcess
-from dyfn_ros.recording_writer import IMAGE, TYPES, RgbdFrame, write_rgbd_recording
 from dyfn_ros.recordings import RecordedFrame, open_recording
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.rosbags_messages import IMAGE, TYPES
 
 COUNT, SIZE = 12, (240, 320)
 CAMERA = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])

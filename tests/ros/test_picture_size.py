@@ -14,8 +14,9 @@ from dyfn_ros.compressed_depth import decode_compressed_depth
 from dyfn_ros.compressed_image import decode_compressed
 from dyfn_ros.encodings import MessageError
 from dyfn_ros.picture_size import MAX_PIXELS, PNG, check_picture_size
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE, RecordingWriter, compressed_message
+from dyfn_ros.recording_writer import RecordingWriter
 from dyfn_ros.recordings import open_recording
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, compressed_message
 
 
 def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:

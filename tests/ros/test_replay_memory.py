@@ -12,8 +12,8 @@ from tiny_model import load_tiny
 
 from dyfn_core.evaluation import protocols
 from dyfn_core.geometry import voxel_grid
-from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
 from dyfn_ros.replay import ALL, main
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 
 FRAMES = 30
 ROUND = 10  # frames until the camera is where it was
