@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -41,13 +40,8 @@ class ReplayRecording:
     def __enter__(self) -> ReplayRecording:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._writer.__exit__(*error)
 
     def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
         """Everything of one frame."""
