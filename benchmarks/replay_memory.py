@@ -5,8 +5,8 @@
 Two recordings of a made room, --frames and four times as many, are replayed in processes of their
 own with every output that is installed, ground truth and poses on. The camera goes round and
 round, so that both see the same room and their fused clouds are alike. Any other OPTION goes to
-dyfn-replay.  Exit code 1 when the peak
-resident memory of the longer one is more than --grow MB above that of the shorter.
+dyfn-replay. Exit code 1 when the peak resident memory of the longer one is more than --grow MB
+above that of the shorter.
 """
 
 from __future__ import annotations

@@ -74,6 +74,7 @@ class SequenceScorer:
         self.frames = FrameScores()
         self._kept = Samples()
         self._step = 1
+        self._video: tuple[int, SequenceScore | None] = (0, None)  # of so many frames
 
     def push(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
@@ -105,7 +106,10 @@ class SequenceScorer:
         """One (scale, shift) for the sequence: min sum_j sum_i (1/d) |s p + t - d|."""
         if self._kept.most < MIN_PIXELS:
             return None
-        return self._aligned(*self._fit(self._kept.prediction, self._kept.target))
+        if self._video[0] != len(self.frames):
+            found = self._aligned(*self._fit(self._kept.prediction, self._kept.target))
+            self._video = (len(self.frames), found)
+        return self._video[1]
 
     def metric(self) -> SequenceScore | None:
         """No alignment: the prediction is taken as metres; disparity has none, hence None."""

@@ -54,7 +54,6 @@ class SequenceEvaluation:
         self.worst = WorstFrames(expected_frames, quantity)
         self._stamps, self._latencies = array("d"), array("d")  # seconds
         self._hash = hashlib.sha256()
-        self._video: tuple[int, SequenceScore | None] = (0, None)
 
     def push(
         self,
@@ -107,10 +106,8 @@ class SequenceEvaluation:
         return {"p50": float(p50), "p99": float(p99)}
 
     def video(self) -> SequenceScore | None:
-        """The sequence under the video protocol, fitted once per number of frames."""
-        if self._video[0] != self.frames:
-            self._video = (self.frames, self.scores.scorer.video())
-        return self._video[1]
+        """The sequence under the video protocol."""
+        return self.scores.scorer.video()
 
     def results(self) -> dict[str, Any]:
         """What goes into metrics.json: protocols (None without truth), controls, spread."""

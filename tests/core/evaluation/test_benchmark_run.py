@@ -67,6 +67,12 @@ def test_files_are_scored_by_value(tmp_path: Path, capsys: pytest.CaptureFixture
     assert scores["metric"]["abs_rel"] == pytest.approx(np.mean(metric), rel=1e-3)
     steps = np.diff(np.log([1 + 0.1 * i for i in range(6)]))
     assert scores["spread"]["log_scale_max_step"] == pytest.approx(steps.max(), abs=1e-3)
+    scale = read(out)["sequences"][0]["over_time"]["mine"]["scale"]
+    ratios = np.divide(scale[1:], scale[:-1])
+    assert ratios == pytest.approx([(1 + 0.1 * i) / (1.1 + 0.1 * i) for i in range(5)], rel=1e-3)
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 3 and "http" not in page
+    assert "Over time, rgbd_dataset_freiburg1_made" in page and str(folder) in page
     printed = capsys.readouterr().out
     for row in ("mine", "control: ramp", "control: constant", "ground truth"):
         assert row in printed
@@ -188,7 +194,7 @@ def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
         files = sorted((tmp_path / "out").iterdir())
         texts.append({path.name: path.read_text() for path in files})
     assert texts[0] == texts[1]
-    assert set(texts[0]) == {"results.json"} | {
+    assert set(texts[0]) == {"results.json", "report.html"} | {
         f"{stem}.{kind}" for stem in ("table", "sequences") for kind in ("md", "csv", "tex")
     }
     table = texts[0]["table.md"]
