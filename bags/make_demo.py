@@ -19,7 +19,7 @@ from dyfn_core.data.worlds.photographer import Photographer
 from dyfn_core.data.worlds.renderer import Renderer
 from dyfn_core.data.worlds.rooms import furnished_room
 from dyfn_core.data.worlds.shards import View
-from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 
 LIBRARY = "BlendSwap-CC-0.sh3f"
 SIZE = (240, 320)

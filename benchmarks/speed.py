@@ -28,8 +28,8 @@ from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.moge import MoGeModel
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.node_process import NodeProcess
-from dyfn_ros.recording_writer import RgbdFrame, write_rgbd_recording
 from dyfn_ros.recordings import open_recording
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 
 SIZES = {"320x240": (240, 320), "640x480": (480, 640)}
 BASELINE_TOKENS = 392  # of 14 x 14 pixels: 320 x 240 in the network

@@ -17,7 +17,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from dyfn_ros.chunked_file import ChunkedFile, Index, Span, read_exactly
 from dyfn_ros.recorded import DAMAGE, MAX_BYTES, Losses, Recorded, Topic, decompress, reason
-from dyfn_ros.recording_writer import TYPES
+from dyfn_ros.rosbags_messages import TYPES
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER = 1 << 20  # a connection's header holds its message definition

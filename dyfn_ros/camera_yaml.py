@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from dyfn_ros.recording_writer import Lens, RecordingError
+from dyfn_ros.recording_error import RecordingError
+from dyfn_ros.rosbags_messages import Lens
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import numpy as np
 
 from dyfn_ros.encodings import MessageError
 from dyfn_ros.messages import depth_fields
+from dyfn_ros.picture_size import PNG, check_picture_size
 
-_PNG = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct("<iff")  # compressedDepth: format, then A and B of z = A / (value - B)
 
 
@@ -21,14 +21,14 @@ def is_compressed_depth(message: Any) -> bool:
     if "compressedDepth" in layout or layout.startswith(("16UC1", "32FC1")):
         return True
     data = bytes(message.data[:26])
-    return data.startswith(_PNG) and data[24:26] == b"\x10\x00"
+    return data.startswith(PNG) and data[24:26] == b"\x10\x00"
 
 
 def decode_compressed_depth(message: Any) -> np.ndarray:
     """CompressedImage with depth -> H x W float32 metres, NaN where there is none.
 
     16-bit PNG in millimetres, plain or as compressedDepth; compressedDepth of 32FC1 is inverse
-    depth. Raises MessageError for anything else, naming the format.
+    depth. Raises MessageError for anything else, naming the format, and for more than MAX_PIXELS.
     """
     layout, data = str(message.format), bytes(message.data)
     inverse: tuple[float, float] | None = None
@@ -78,10 +78,11 @@ def encode_compressed_depth(
 
 
 def _png16(layout: str, data: bytes) -> np.ndarray:
-    if not data.startswith(_PNG):
+    if not data.startswith(PNG):
         raise MessageError(f"depth of format {layout!r}: expected a 16-bit PNG, found none")
     if b"IEND" not in data[-64:]:
         raise MessageError(f"depth of format {layout!r} ends early: {len(data)} bytes")
+    check_picture_size(data)
     try:
         values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 
 from dyfn_ros.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
+from dyfn_ros.picture_size import JPEG, PNG, check_picture_size
 
-_JPEG = b"\xff\xd8\xff"
-_PNG = b"\x89PNG\r\n\x1a\n"
 _LAYOUT = re.compile(
     r"^\s*(?:(?P<encoding>\w+)\s*;\s*)?(?P<codec>\w+)(?:\s+compressed\s*(?P<order>\w*))?"
 )
@@ -46,10 +45,13 @@ def decode_compressed(message: Any) -> np.ndarray:
 
     What the data is decides on the codec. `format` decides on what a file cannot say: whether a
     grey one is a Bayer mosaic, and whether the codec was given RGB where files have BGR.
-    Raises MessageError for other codecs, depth transports, and incomplete or broken files.
+    Raises MessageError for other codecs, depth transports, incomplete or broken files, and more
+    than MAX_PIXELS.
     """
     data, text = np.frombuffer(message.data, np.uint8), str(message.format)
-    _check_complete(data.tobytes(), text)
+    content = data.tobytes()
+    _check_complete(content, text)
+    check_picture_size(content)
     layout = parse_format(text)
     mosaic = layout.encoding.startswith("bayer_") and layout.order in ("", layout.encoding)
     try:
@@ -91,9 +93,9 @@ def _check_complete(data: bytes, name: str) -> None:
     """Decoders fill what a cut-off file lacks with grey; that is no measurement."""
     if "compressedDepth" in name:
         raise MessageError(f"format {name!r} is a depth image; expected a JPEG or PNG colour image")
-    if data.startswith(_JPEG):
+    if data.startswith(JPEG):
         complete = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
-    elif data.startswith(_PNG):
+    elif data.startswith(PNG):
         complete = b"IEND" in data[-64:]
     else:
         raise MessageError(

@@ -23,8 +23,8 @@ from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, sco
 from dyfn_core.evaluation.sequence_report import sequence_sections
 from dyfn_ros.environment import prepare_environment
 from dyfn_ros.node_process import NODE_COMMAND, LiveError, NodeProcess
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE
 from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE
 
 if TYPE_CHECKING:
     from dyfn_ros.live_player import LivePlayer

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from dyfn_ros.finished_file import finished_file
 from dyfn_ros.fleet_summary import Row, write_summary
-from dyfn_ros.recording_writer import RecordingError
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, ModelLoader, load, replay
 from dyfn_ros.replay_options import Options, split
 from dyfn_ros.rgbd_folder import is_rgbd_folder

@@ -15,7 +15,7 @@ from dyfn_ros.encodings import MessageError
 from dyfn_ros.messages import Calibration, decode_camera_info, decode_depth
 from dyfn_ros.metric_messages import Transform, decode_points
 from dyfn_ros.recorded import Recorded
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE, POINT_CLOUD
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, POINT_CLOUD
 
 SAME = 2e-3  # of the image's width and height: intrinsics that differ by less are the same
 

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,8 @@ from std_srvs.srv import Trigger
 
 from dyfn_ros.messages import cloud_points, decode_depth
 from dyfn_ros.node_process import LiveError, NodeProcess
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE, TYPES
 from dyfn_ros.recordings import RecordedFrame
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, TYPES
 
 OUTPUTS = {"depth/image": Image, "depth/camera_info": CameraInfo, "points": PointCloud2}
 START_PATIENCE = 180.0  # seconds for imports and loading the model, on a busy machine
@@ -83,12 +82,7 @@ class LivePlayer:
     def __enter__(self) -> LivePlayer:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._executor.shutdown()
         self._thread.join(5)
         self._node.destroy_node()

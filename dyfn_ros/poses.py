@@ -11,8 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from dyfn_core.data.datasets.axes import inverse, quaternion_rotation, rigid
-from dyfn_ros.recording_writer import POSE, TF, RecordingError
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.rgbd_folder import is_rgbd_folder, read_poses
+from dyfn_ros.rosbags_messages import POSE, TF
 from dyfn_ros.storage import Storage, open_storage
 from dyfn_ros.topics import NONE
 

@@ -14,8 +14,10 @@ from dyfn_core.data.datasets import rgbd_folder as layouts
 from dyfn_core.data.frames import DataError, DataReport, FrameError, NumberedSequence
 from dyfn_ros.camera_stream import pixel_matrix
 from dyfn_ros.camera_yaml import CameraYaml
-from dyfn_ros.recording_writer import Lens, RecordingError, RgbdFrame
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.rgbd_folder import is_rgbd_folder, read_rgbd_folder
+from dyfn_ros.rgbd_recording import RgbdFrame
+from dyfn_ros.rosbags_messages import Lens
 
 PLAIN_RATE, SENSOR_RATE = 10.0, 30.0  # frames a second of folders without stamps
 Warn = Callable[[str], None]

@@ -9,20 +9,19 @@ from typing import Any, Literal
 from dyfn_ros.metric_messages import parse_pose
 from dyfn_ros.recorded import Recorded
 from dyfn_ros.recorded_frames import Notes, RecordedFrame, Recording
-from dyfn_ros.recording_writer import (
+from dyfn_ros.recording_error import RecordingError
+from dyfn_ros.recording_writer import RecordingWriter
+from dyfn_ros.rgbd_folder import IMAGE_SUFFIXES, is_rgbd_folder, numbered, read_rgbd_folder
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.ros_recording import RosRecording
+from dyfn_ros.rosbags_messages import (
     CAMERA_INFO,
     IMAGE,
     POINT_CLOUD,
     TYPES,
-    RecordingError,
-    RecordingWriter,
-    RgbdFrame,
     camera_info,
     image_message,
-    write_rgbd_recording,
 )
-from dyfn_ros.rgbd_folder import IMAGE_SUFFIXES, is_rgbd_folder, numbered, read_rgbd_folder
-from dyfn_ros.ros_recording import RosRecording
 from dyfn_ros.storage import open_storage
 from dyfn_ros.topics import Topics, choose_topics
 from dyfn_ros.topics import image_topics as list_image_topics

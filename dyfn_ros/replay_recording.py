@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -10,18 +9,18 @@ import numpy as np
 from dyfn_core.evaluation.protocols import FrameScore, sample_grid
 from dyfn_ros.camera_stream import Geometry
 from dyfn_ros.messages import CLOUD_OFFSETS, CLOUD_STEP, depth_fields, pack_cloud
-from dyfn_ros.recording_writer import (
+from dyfn_ros.recording_writer import RecordingWriter
+from dyfn_ros.recordings import RecordedFrame
+from dyfn_ros.rosbags_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     FLOAT,
     IMAGE,
     POINT_CLOUD,
     TYPES,
-    RecordingWriter,
     camera_info,
     header,
 )
-from dyfn_ros.recordings import RecordedFrame
 
 MAX_POINTS = 20_000
 _FLOAT32 = 7  # sensor_msgs/PointField
@@ -41,13 +40,8 @@ class ReplayRecording:
     def __enter__(self) -> ReplayRecording:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._writer.__exit__(*error)
 
     def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
         """Everything of one frame."""

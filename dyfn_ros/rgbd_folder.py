@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_ros.recording_writer import RecordingError, RgbdFrame
+from dyfn_ros.recording_error import RecordingError
+from dyfn_ros.rgbd_recording import RgbdFrame
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 

@@ -18,7 +18,8 @@ from dyfn_ros.messages import decode_image
 from dyfn_ros.metric_messages import Transform
 from dyfn_ros.recorded import Recorded, Storage
 from dyfn_ros.recorded_frames import Notes, RecordedFrame
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE, RecordingError
+from dyfn_ros.recording_error import RecordingError
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE
 from dyfn_ros.topics import Topics
 
 

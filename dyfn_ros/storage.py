@@ -14,7 +14,7 @@ import zstandard
 from dyfn_ros.bag1_file import Bag1File
 from dyfn_ros.mcap_file import McapFile
 from dyfn_ros.recorded import DAMAGE, Recorded, Storage, Topic, reason
-from dyfn_ros.recording_writer import RecordingError
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.sqlite_file import SqliteFile
 
 __all__ = ["SUFFIXES", "Recorded", "Storage", "Topic", "is_recording", "open_storage"]

@@ -10,13 +10,8 @@ from typing import Any
 
 from dyfn_ros.compressed_depth import is_compressed_depth
 from dyfn_ros.recorded import Storage
-from dyfn_ros.recording_writer import (
-    CAMERA_INFO,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    POINT_CLOUD,
-    RecordingError,
-)
+from dyfn_ros.recording_error import RecordingError
+from dyfn_ros.rosbags_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}

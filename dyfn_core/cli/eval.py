@@ -17,6 +17,7 @@ from typing import Any
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval_arguments import add_benchmark, add_model, add_predictions
 from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmark_report import write_benchmark_report
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate
 from dyfn_core.evaluation.benchmark_table import write_json, write_results
 from dyfn_core.evaluation.benchmarks import (
@@ -148,6 +149,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     )
     results = {**_provenance(options), **results}
     table = write_results(results, options.out, _title(opened), options.ablations)
+    write_benchmark_report(options.out / "report.html", _title(opened), table, results)
     return _finish(text_table(table), results, options.out)
 
 

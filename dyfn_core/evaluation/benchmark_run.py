@@ -102,6 +102,7 @@ def score_sequence(
         "last": sequence.numbers[-1],
         "temporal_truth": steadiness.get(TRUTH),
         "variants": variants,
+        "over_time": {name: _over_time(scorer) for name, scorer in scorers.scorers.items()},
     }
 
 
@@ -136,6 +137,20 @@ def _summary(scorer: SequenceScorer) -> dict[str, Any]:
         "coverage": float(np.mean(scored)) if scored else None,
         "scored_frames": len(scored),
         "spread": spread(scorer.frames),
+    }
+
+
+def _over_time(scorer: SequenceScorer) -> dict[str, list[float | None]]:
+    """scale and shift of each frame, and its AbsRel under the video protocol; None: unscored."""
+    columns = {name: scorer.frames.column(name) for name in ("scale", "shift")}
+    video = scorer.video()
+    errors = (
+        np.full(len(scorer.frames), np.nan) if video is None else video.frames.column("abs_rel")
+    )
+    columns["video_abs_rel"] = errors
+    return {
+        name: [None if np.isnan(value) else float(value) for value in values]
+        for name, values in columns.items()
     }
 
 

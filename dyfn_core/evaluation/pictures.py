@@ -192,14 +192,14 @@ def draw_cloud(
 
 
 def curves(
-    panels: Mapping[str, Mapping[str, Sequence[float | None]]], x_label: str = "frame"
+    panels: Mapping[str, Mapping[str, Sequence[float | None] | np.ndarray]], x_label: str = "frame"
 ) -> np.ndarray:
-    """Panels (title -> line name -> a value per frame, None for a gap) as one RGB picture."""
+    """Panels (title -> line name -> a value per frame, None: a gap) as one RGB picture."""
     figure = Figure(figsize=(8.4, 2.3 * len(panels)), dpi=100, layout="constrained")
     axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
     for axis, (title, lines) in zip(axes, panels.items(), strict=True):
         for name, values in lines.items():
-            axis.plot([np.nan if v is None else v for v in values], label=name, linewidth=1.3)
+            axis.plot(np.array(values, np.float64), label=name, linewidth=1.3)  # None: NaN
         axis.set_title(title, fontsize=10, loc="left")
         axis.grid(alpha=0.3)
         axis.tick_params(labelsize=8)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.evaluation.metrics import depth_metrics, mean_metrics
+from dyfn_core.evaluation.frame_scores import FrameScore, FrameScores, MetricRows
+from dyfn_core.evaluation.metrics import depth_metrics
+from dyfn_core.evaluation.samples import Samples
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.prediction import DEPTH, DISPARITY
 
@@ -17,22 +19,6 @@ MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is
 MIN_PIXELS = 16  # frames with fewer scored samples are not scored
 ALL_PIXELS = 1 << 62  # as samples_per_frame and max_samples: nothing is left out
 L1, LEAST_SQUARES = FITS = ("l1", "lstsq")
-
-
-@dataclass(frozen=True)
-class FrameScore:
-    """One frame under the image protocol.
-
-    coverage: share of the pixels with truth where the prediction is valid.
-    pixels: scored samples. scale, shift: this frame's own alignment; with metrics None when
-        fewer than MIN_PIXELS samples could be scored.
-    """
-
-    coverage: float
-    pixels: int
-    scale: float | None = None
-    shift: float | None = None
-    metrics: dict[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -46,7 +32,7 @@ class SequenceScore:
     metrics: dict[str, float]
     scale: float
     shift: float
-    frames: list[dict[str, float] | None]
+    frames: MetricRows
 
 
 class SequenceScorer:
@@ -85,10 +71,10 @@ class SequenceScorer:
         self.depth_max = depth_max
         self.samples_per_frame = samples_per_frame
         self.max_samples = max_samples
-        self.frames: list[FrameScore] = []
-        self._kept: list[tuple[np.ndarray, np.ndarray]] = []
+        self.frames = FrameScores()
+        self._kept = Samples()
         self._step = 1
-        self._total = 0
+        self._video: tuple[int, SequenceScore | None] = (0, None)  # of so many frames
 
     def push(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
@@ -110,25 +96,24 @@ class SequenceScorer:
 
     def image(self) -> SequenceScore | None:
         """Each frame aligned by its own scale and shift; None when no frame could be scored."""
-        scored = [f for f in self.frames if f.metrics is not None]
-        if not scored:
+        means = self.frames.metrics.means()
+        if means is None:
             return None
-        scale = float(np.median([f.scale for f in scored if f.scale is not None]))
-        shift = float(np.median([f.shift for f in scored if f.shift is not None]))
-        frames = [f.metrics for f in self.frames]
-        return SequenceScore(mean_metrics([f for f in frames if f]), scale, shift, frames)
+        scale, shift = (float(np.nanmedian(self.frames.column(c))) for c in ("scale", "shift"))
+        return SequenceScore(means, scale, shift, self.frames.metrics)
 
     def video(self) -> SequenceScore | None:
         """One (scale, shift) for the sequence: min sum_j sum_i (1/d) |s p + t - d|."""
-        if not any(p.size >= MIN_PIXELS for p, _ in self._kept):
+        if self._kept.most < MIN_PIXELS:
             return None
-        target = np.concatenate([d for _, d in self._kept])
-        prediction = np.concatenate([p for p, _ in self._kept])
-        return self._aligned(*self._fit(prediction, target.astype(np.float64)))
+        if self._video[0] != len(self.frames):
+            found = self._aligned(*self._fit(self._kept.prediction, self._kept.target))
+            self._video = (len(self.frames), found)
+        return self._video[1]
 
     def metric(self) -> SequenceScore | None:
         """No alignment: the prediction is taken as metres; disparity has none, hence None."""
-        if self.quantity == DISPARITY or not any(p.size >= MIN_PIXELS for p, _ in self._kept):
+        if self.quantity == DISPARITY or self._kept.most < MIN_PIXELS:
             return None
         return self._aligned(1.0, 0.0)
 
@@ -139,10 +124,12 @@ class SequenceScorer:
         return fit_scale_shift(prediction, wanted, 1 / wanted)
 
     def _aligned(self, scale: float, shift: float) -> SequenceScore:
-        frames = [
-            self._score(p, d, scale, shift) if p.size >= MIN_PIXELS else None for p, d in self._kept
-        ]
-        return SequenceScore(mean_metrics([f for f in frames if f]), scale, shift, frames)
+        rows = MetricRows()
+        for p, d in self._kept:
+            rows.append(self._score(p, d, scale, shift) if p.size >= MIN_PIXELS else None)
+        means = rows.means()
+        assert means is not None, "only of samples that are scorable"
+        return SequenceScore(means, scale, shift, rows)
 
     def _score(
         self, prediction: np.ndarray, target: np.ndarray, scale: float, shift: float
@@ -167,12 +154,10 @@ class SequenceScorer:
         return p[valid], d[valid], coverage
 
     def _keep(self, prediction: np.ndarray, target: np.ndarray) -> None:
-        self._kept.append((prediction[:: self._step].copy(), target[:: self._step].copy()))
-        self._total += self._kept[-1][0].size
-        if self._total > self.max_samples:
+        self._kept.append(prediction[:: self._step], target[:: self._step])
+        if self._kept.size > self.max_samples:
             self._step *= 2
-            self._kept = [(p[::2].copy(), d[::2].copy()) for p, d in self._kept]
-            self._total = sum(p.size for p, _ in self._kept)
+            self._kept = self._kept.halved()
 
 
 def least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, float]:
@@ -251,10 +236,12 @@ class ControlledScorer:
         self,
         depth_max: float = math.inf,
         control_samples: int = 4_000,
+        max_control_samples: int = 800_000,
         quantity: str = DEPTH,
     ) -> None:
         self.scorer = SequenceScorer(depth_max, quantity=quantity)
-        self.controls = {name: SequenceScorer(depth_max, control_samples) for name in CONTROLS}
+        limits = depth_max, control_samples, max_control_samples
+        self.controls = {name: SequenceScorer(*limits) for name in CONTROLS}
 
     def push(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
@@ -268,7 +255,7 @@ class ControlledScorer:
         return self.scorer.push(prediction, target, valid)
 
 
-def spread(frames: list[FrameScore]) -> dict[str, float] | None:
+def spread(frames: Sequence[FrameScore]) -> dict[str, float] | None:
     """How far scale and shift wander over the frames of a sequence; None under two scored frames.
 
     log_scale_std: standard deviation of log(scale) over frames with a positive scale;

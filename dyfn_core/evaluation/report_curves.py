@@ -24,7 +24,7 @@ class Curves:
     """Lines over the frames. lines: name -> a value per frame, None (or not finite) for a gap."""
 
     title: str
-    lines: Mapping[str, Sequence[float | None]]
+    lines: Mapping[str, Sequence[float | None] | np.ndarray]
     x_label: str = "frame"
 
 
@@ -33,17 +33,19 @@ class Histogram:
     """How often values occur. values: name -> values in `unit`; marks: name -> places to mark."""
 
     title: str
-    values: Mapping[str, Sequence[float]]
+    values: Mapping[str, Sequence[float] | np.ndarray]
     unit: str
     marks: Mapping[str, Mapping[str, float]]
 
 
-def decimate(values: Sequence[float | None], buckets: int = BUCKETS) -> list[list[Point]]:
+def decimate(
+    values: Sequence[float | None] | np.ndarray, buckets: int = BUCKETS
+) -> list[list[Point]]:
     """Runs of (frame, value) without a gap inside; long curves keep each bucket's extremes.
 
     At most 2 * buckets points in all. A gap shorter than a bucket of a long curve is not seen.
     """
-    found = np.array([np.nan if v is None else v for v in values], np.float64)
+    found = np.array(values, np.float64)  # None becomes NaN
     known = np.flatnonzero(np.isfinite(found))
     size = max(1, math.ceil(len(found) / buckets)) if len(found) > 2 * buckets else 1
     runs: list[list[Point]] = []

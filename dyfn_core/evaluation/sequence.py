@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ COLUMNS = (
     "scale",
     "shift",
 )
+COUNTS = ("frame", "pixels")  # those of COLUMNS that are integers
 
 
 class SequenceEvaluation:
@@ -50,10 +52,8 @@ class SequenceEvaluation:
         self.scores = ControlledScorer(depth_max, quantity=quantity)
         self.strip = FrameStrip(expected_frames, quantity=quantity)
         self.worst = WorstFrames(expected_frames, quantity)
-        self._stamps: list[float] = []
-        self._latencies: list[float] = []
+        self._stamps, self._latencies = array("d"), array("d")  # seconds
         self._hash = hashlib.sha256()
-        self._video: tuple[int, SequenceScore | None] = (0, None)
 
     def push(
         self,
@@ -106,10 +106,8 @@ class SequenceEvaluation:
         return {"p50": float(p50), "p99": float(p99)}
 
     def video(self) -> SequenceScore | None:
-        """The sequence under the video protocol, fitted once per number of frames."""
-        if self._video[0] != self.frames:
-            self._video = (self.frames, self.scores.scorer.video())
-        return self._video[1]
+        """The sequence under the video protocol."""
+        return self.scores.scorer.video()
 
     def results(self) -> dict[str, Any]:
         """What goes into metrics.json: protocols (None without truth), controls, spread."""
@@ -130,29 +128,30 @@ class SequenceEvaluation:
             "output_sha256": self.output_hash,
         }
 
-    def rows(self) -> list[dict[str, Cell]]:
+    def column(self, name: str) -> np.ndarray:
+        """One of COLUMNS of every frame, float64; NaN where there is no truth."""
+        scores, video = self.scores.scorer.frames, self.video()
+        protocol, _, metric = name.partition("_")
+        if name == "frame":
+            return np.arange(self.frames, dtype=np.float64)
+        if name == "stamp":
+            return np.array(self._stamps)
+        if name == "latency_ms":
+            return np.array(self._latencies) * 1000
+        if protocol == "video":
+            return np.full(self.frames, np.nan) if video is None else video.frames.column(metric)
+        if protocol == "image":
+            return scores.metrics.column(metric)
+        return scores.column(name)
+
+    def rows(self) -> Iterator[dict[str, Cell]]:
         """One dict of COLUMNS per frame; None where there is no truth."""
-        scorer = self.scores.scorer
-        video = self.video()
-        aligned = [None] * self.frames if video is None else video.frames
-        found = []
-        for index, frame in enumerate(scorer.frames):
-            image, other = frame.metrics or {}, aligned[index] or {}
-            values: tuple[Cell, ...] = (
-                index,
-                self._stamps[index],
-                self._latencies[index] * 1000,
-                frame.coverage,
-                frame.pixels,
-                image.get("abs_rel"),
-                image.get("delta1"),
-                other.get("abs_rel"),
-                other.get("delta1"),
-                frame.scale,
-                frame.shift,
-            )
-            found.append(dict(zip(COLUMNS, values, strict=True)))
-        return found
+        columns = [self.column(name) for name in COLUMNS]
+        for values in zip(*columns, strict=True):
+            yield {
+                name: int(value) if name in COUNTS else None if np.isnan(value) else float(value)
+                for name, value in zip(COLUMNS, values, strict=True)
+            }
 
     def draw_strip(self) -> np.ndarray:
         """The strip, aligned as the video protocol does (H x W x 3 uint8 RGB)."""
@@ -165,8 +164,8 @@ def _means(score: SequenceScore | None) -> dict[str, float] | None:
 
 
 def _coverage(scorer: SequenceScorer) -> float | None:
-    scored = [f.coverage for f in scorer.frames if f.metrics is not None]
-    return float(np.mean(scored)) if scored else None
+    scored = scorer.frames.column("coverage")[~np.isnan(scorer.frames.column("scale"))]
+    return float(np.mean(scored)) if scored.size else None
 
 
 def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
@@ -192,27 +191,19 @@ def _scores(result: Mapping[str, dict[str, float] | None]) -> list[Cell]:
 
 def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:
     """Per-frame scale (over its median) and error over time, a line per run."""
-    rows = {name: run.rows() for name, run in runs.items()}
     return curves(
         {
             "scale that fits each frame, over its median (flat is stable)": {
-                name: over_median(column(found, "scale")) for name, found in rows.items()
+                name: over_median(run.column("scale")) for name, run in runs.items()
             },
             "AbsRel, one alignment for the sequence (video protocol)": {
-                name: column(found, "video_abs_rel") for name, found in rows.items()
+                name: run.column("video_abs_rel") for name, run in runs.items()
             },
         }
     )
 
 
-def column(rows: Sequence[Mapping[str, Cell]], name: str) -> list[float | None]:
-    """The numbers of one of COLUMNS, None where there is none."""
-    cells = [row[name] for row in rows]
-    return [float(cell) if isinstance(cell, (int, float)) else None for cell in cells]
-
-
-def over_median(values: Sequence[float | None]) -> list[float | None]:
-    """Values over the median of those that are known; all None when that is 0 or nothing is."""
-    known = [value for value in values if value is not None]
-    middle = float(np.median(known)) if known else 0.0
-    return [None if value is None or middle == 0 else value / middle for value in values]
+def over_median(values: np.ndarray) -> np.ndarray:
+    """Values over the median of those that are not NaN; all NaN when that is 0 or nothing is."""
+    middle = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
+    return values / middle if middle else np.full(len(values), np.nan)

@@ -20,7 +20,6 @@ from dyfn_core.evaluation.report import (
 )
 from dyfn_core.evaluation.sequence import (
     SequenceEvaluation,
-    column,
     over_median,
     score_table,
 )
@@ -82,13 +81,11 @@ def _key_figures(result: Mapping[str, Any]) -> KeyFigures:
 
 
 def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
-    rows = {name: run.rows() for name, run in runs.items()}
-
-    def lines(name_of_column: str) -> dict[str, list[float | None]]:
-        return {name: column(found, name_of_column) for name, found in rows.items()}
+    def lines(column: str) -> dict[str, np.ndarray]:
+        return {name: run.column(column) for name, run in runs.items()}
 
     scale = {name: over_median(values) for name, values in lines("scale").items()}
-    if not any(value is not None for values in scale.values() for value in values):
+    if np.isnan(np.concatenate(list(scale.values()))).all():
         return []
     parts: list[Part] = [
         Curves("Scale that fits each frame, over its median (flat is stable)", scale),
@@ -103,8 +100,7 @@ def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
     video = run.video()
     if video is None:
         return []
-    rows = run.rows()
-    errors, stamps = column(rows, "video_abs_rel"), column(rows, "stamp")
+    errors, stamps = run.column("video_abs_rel"), run.column("stamp")
     table: list[list[Cell]] = []
     shown = []
     for index in run.worst.choose(errors):
@@ -112,7 +108,7 @@ def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
         if found is not None:
             shown.append(found)
         picture = "not kept" if found is None else f"frame {found.index}"
-        table.append([f"frame {index}", f"{stamps[index]:.3f}", errors[index], picture])
+        table.append([f"frame {index}", f"{stamps[index]:.3f}", float(errors[index]), picture])
     header = ("worst first", "stamp, s", "AbsRel", "picture")
     parts: list[Part] = [Table(header, table), Text(WORST_NOTE, note=True)]
     if shown:
@@ -125,9 +121,6 @@ def _latency(runs: Mapping[str, SequenceEvaluation]) -> Section:
     rows: list[list[Cell]] = [
         [name, *(f"{value:.1f}" for value in found.values())] for name, found in marks.items()
     ]
-    values = {
-        name: [value for value in column(run.rows(), "latency_ms") if value is not None]
-        for name, run in runs.items()
-    }
+    values = {name: run.column("latency_ms") for name, run in runs.items()}
     histogram = Histogram("Time per frame", values, "ms", marks)
     return Section("Latency", [histogram, Table(("", "p50 ms", "p99 ms"), rows)])

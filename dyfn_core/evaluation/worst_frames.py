@@ -70,21 +70,21 @@ class WorstFrames:
             return badness > same.badness
         return len(kept) < KEPT or badness > min(c.badness for c in kept.values())
 
-    def choose(self, errors: Sequence[float | None], count: int = 6) -> list[int]:
-        """The worst frame of each of the `count` worst stretches, worst first."""
+    def choose(self, errors: np.ndarray, count: int = 6) -> list[int]:
+        """The worst frame of each of the `count` worst stretches, worst first. errors: of every
+        frame, NaN where there is none."""
         chosen: dict[int, int] = {}
-        known = [(error, index) for index, error in enumerate(errors) if error is not None]
-        for _, index in sorted(known, key=lambda item: (-item[0], item[1])):
-            if len(chosen) == count:
+        for index in np.argsort(-errors, kind="stable").tolist():  # NaN comes last
+            if len(chosen) == count or np.isnan(errors[index]):
                 break
             chosen.setdefault(index // self.stretch, index)
         return list(chosen.values())
 
-    def nearest(self, index: int, errors: Sequence[float | None]) -> Snapshot | None:
+    def nearest(self, index: int, errors: np.ndarray) -> Snapshot | None:
         """The kept frame of the same stretch with the largest error; None when none was kept."""
         place = index // self.stretch
         found = [kept[place].snapshot for kept in self._kept if place in kept]
-        return max(found, key=lambda s: errors[s.index] or 0.0, default=None)
+        return max(found, key=lambda s: np.nan_to_num(errors[s.index]), default=None)
 
     def draw(self, snapshots: Sequence[Snapshot], scale: float, shift: float) -> np.ndarray:
         """One row a frame, as FrameStrip.draw."""

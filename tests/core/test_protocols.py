@@ -108,7 +108,7 @@ def test_memory_is_bounded_and_the_result_hardly_changes() -> None:
         prediction = truth**0.9 * (1 + 0.02 * index)
         bounded.push(prediction, truth)
         full.push(prediction, truth)
-    assert bounded._total <= 2000
+    assert bounded._kept.size <= 2000
     assert len(bounded._kept) == 12
     a, b = bounded.video(), full.video()
     assert a is not None and b is not None

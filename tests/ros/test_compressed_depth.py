@@ -12,7 +12,7 @@ from dyfn_ros.compressed_depth import (
     is_compressed_depth,
 )
 from dyfn_ros.encodings import MessageError
-from dyfn_ros.recording_writer import compressed_message
+from dyfn_ros.rosbags_messages import compressed_message
 
 
 def png(values: np.ndarray) -> bytes:

@@ -16,7 +16,7 @@ from tiny_model import load_tiny
 from dyfn_ros import replay
 from dyfn_ros.demo import FAILED, OK, UNUSABLE, main
 from dyfn_ros.node_process import LiveError, NodeExitError, NodeProcess
-from dyfn_ros.recording_writer import write_rgbd_recording
+from dyfn_ros.rgbd_recording import write_rgbd_recording
 
 TINY_NODE = [sys.executable, str(HERE / "tiny_node.py")]
 

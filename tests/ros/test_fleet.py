@@ -13,8 +13,9 @@ from tiny_model import load_tiny
 from dyfn_ros import fleet
 from dyfn_ros.fleet import CRASHED, Outcome, expand, is_many, plan, run_locally
 from dyfn_ros.fleet_summary import mean_of
-from dyfn_ros.recording_writer import RecordingError, RgbdFrame, write_rgbd_recording
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, Options, main, replay
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
 

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
-from dyfn_ros.recording_writer import (
+from dyfn_ros.recording_writer import RecordingWriter
+from dyfn_ros.recordings import RecordedFrame, RecordingError, image_topics, open_recording
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.rosbags_messages import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
     TYPES,
-    RecordingWriter,
-    RgbdFrame,
     camera_info,
     compressed_message,
     image_message,
-    write_rgbd_recording,
 )
-from dyfn_ros.recordings import RecordedFrame, RecordingError, image_topics, open_recording
 from dyfn_ros.topics import Topics
 
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])

@@ -16,8 +16,10 @@ from tiny_model import load_tiny
 from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_ros.messages import cloud_points, decode_depth
-from dyfn_ros.recording_writer import IMAGE, TYPES, RecordingWriter, RgbdFrame, write_rgbd_recording
+from dyfn_ros.recording_writer import RecordingWriter
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
+from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.rosbags_messages import IMAGE, TYPES
 from dyfn_ros.threads import THREADS
 
 SIZE = (36, 48)

@@ -19,13 +19,15 @@ from tiny_model import load_tiny
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_ros.camera_stream import Geometry
 from dyfn_ros.poses import ODOMETRY, PoseError, open_poses
-from dyfn_ros.recording_writer import TYPES, RecordingWriter, RgbdFrame, header
-from dyfn_ros.recording_writer import write_rgbd_recording as record
+from dyfn_ros.recording_writer import RecordingWriter
 from dyfn_ros.recordings import open_recording
 from dyfn_ros.replay import ALL, UNUSABLE, main
 from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
 from dyfn_ros.replay_rerun import ROOM
 from dyfn_ros.replay_video import Alignment
+from dyfn_ros.rgbd_recording import RgbdFrame
+from dyfn_ros.rgbd_recording import write_rgbd_recording as record
+from dyfn_ros.rosbags_messages import TYPES, header
 
 SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])

@@ -23,8 +23,9 @@ from made_recordings import (
 
 from dyfn_ros.chunked_file import MAX_OPEN, Span, merged
 from dyfn_ros.recorded import MOST_LOSSES, Recorded, decompress
-from dyfn_ros.recording_writer import IMAGE, RecordingError
+from dyfn_ros.recording_error import RecordingError
 from dyfn_ros.recordings import open_recording
+from dyfn_ros.rosbags_messages import IMAGE
 from dyfn_ros.storage import is_recording, open_storage
 
 COUNT = 24

@@ -28,6 +28,7 @@ from ros_graph import (
     tiny_node,
 )
 from sensor_msgs.msg import CompressedImage, Image
+from test_picture_size import png
 from tiny_model import BLOCKING, FAILING, load_tiny
 
 from dyfn_core.stream import DepthStream
@@ -439,12 +440,15 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
         stamps.append(client.send_message(message))
     broken = CompressedImage(format="png", data=array.array("B", b"no picture"))
     client.send_message(broken)
+    bomb = CompressedImage(format="png", data=array.array("B", png(60_000, 60_000)))
+    client.send_message(bomb)
     client.settle()
     assert not any(client.received[stamp] for stamp in stamps)
     client.send_info(camera_info())
     matrix = np.reshape(camera_info().k, (3, 3))
     assert depth_bytes([client.result(s) for s in stamps]) == offline(images, matrix)
     node.wait_log(r"WARN\].*/front/image/compressed: .*neither JPEG nor PNG")
+    node.wait_log(r"WARN\].*/front/image/compressed: .*60000 x 60000 pixels; at most")
     assert node.end() == 0
 
 

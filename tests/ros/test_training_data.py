@@ -19,7 +19,8 @@ from dyfn_core.data.datasets import data_kind, open_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec, open_pool
 from dyfn_core.models.checkpoints import load_model
-from dyfn_ros.recording_writer import COMPRESSED_IMAGE, RecordingWriter, compressed_message
+from dyfn_ros.recording_writer import RecordingWriter
+from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, compressed_message
 
 SIZE = (48, 64)
 CAMERA = np.array([[50.0, 0, 30.5], [0, 52.0, 24.5], [0, 0, 1]])

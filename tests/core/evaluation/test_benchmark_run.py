@@ -17,6 +17,7 @@ from dyfn_core.cli import eval as cli
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate, mean_of
 from dyfn_core.evaluation.benchmark_table import HEADER
 from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Settings, open_benchmark
+from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
 from dyfn_core.evaluation.long_sequence import length_table, long_sequences
 from dyfn_core.evaluation.model_method import ModelMethod, as_array
 from dyfn_core.evaluation.predictions import ArrayMethod
@@ -66,6 +67,12 @@ def test_files_are_scored_by_value(tmp_path: Path, capsys: pytest.CaptureFixture
     assert scores["metric"]["abs_rel"] == pytest.approx(np.mean(metric), rel=1e-3)
     steps = np.diff(np.log([1 + 0.1 * i for i in range(6)]))
     assert scores["spread"]["log_scale_max_step"] == pytest.approx(steps.max(), abs=1e-3)
+    scale = read(out)["sequences"][0]["over_time"]["mine"]["scale"]
+    ratios = np.divide(scale[1:], scale[:-1])
+    assert ratios == pytest.approx([(1 + 0.1 * i) / (1.1 + 0.1 * i) for i in range(5)], rel=1e-3)
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 3 and "http" not in page
+    assert "Over time, rgbd_dataset_freiburg1_made" in page and str(folder) in page
     printed = capsys.readouterr().out
     for row in ("mine", "control: ramp", "control: constant", "ground truth"):
         assert row in printed
@@ -156,6 +163,26 @@ def test_a_model_runs_as_its_stream_does(tmp_path: Path, pinhole_with_dyfn: Geom
     assert not np.array_equal(found["m + DyFN"], found["m, base"])
 
 
+def test_controls_of_the_latent_are_streams_with_that_stabilizer(
+    tmp_path: Path, pinhole_with_dyfn: GeometryModel
+) -> None:
+    model = pinhole_with_dyfn
+    sequence = open_benchmark("tum", room(tmp_path)).sequences[0]
+    predict = ModelMethod("m", model).open(sequence)
+    found = [predict(i, frame) for i, frame in enumerate(sequence.frames())]
+    channels = model.latent_channels
+    for name, control in {"ema": ema_control(channels), "frozen": frozen_control(channels)}.items():
+        with stabilized_by(model, control):
+            stream = DepthStream(model)
+            for index, frame in enumerate(sequence.frames()):
+                wanted = as_array(stream.push(frame.image, float(index)))
+                np.testing.assert_array_equal(found[index][f"control: {name}"], wanted)
+    last = [found[-1][name] for name in ("control: ema", "control: frozen", "m, base", "m + DyFN")]
+    assert len({array.tobytes() for array in last}) == 4
+    plain = ModelMethod("m", model, stabilize=False, controls=False)  # --no-controls
+    assert plain.variants == ("m, base",)
+
+
 def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     make_video(tmp_path / "bonn", "rgbd_bonn_crowd2", 2)
@@ -167,7 +194,7 @@ def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
         files = sorted((tmp_path / "out").iterdir())
         texts.append({path.name: path.read_text() for path in files})
     assert texts[0] == texts[1]
-    assert set(texts[0]) == {"results.json"} | {
+    assert set(texts[0]) == {"results.json", "report.html"} | {
         f"{stem}.{kind}" for stem in ("table", "sequences") for kind in ("md", "csv", "tex")
     }
     table = texts[0]["table.md"]

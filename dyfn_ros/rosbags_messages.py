@@ -1,0 +1,145 @@
+"""ROS messages for recordings, made of arrays without a ROS installation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import Stores, get_typestore
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+POSE = "geometry_msgs/msg/PoseStamped"
+TF = "tf2_msgs/msg/TFMessage"
+FLOAT = "std_msgs/msg/Float64"
+
+
+@dataclass(frozen=True)
+class Lens:
+    """model: plumb_bob, rational_polynomial or equidistant. coefficients: as CameraInfo.d."""
+
+    model: str
+    coefficients: tuple[float, ...]
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """A std_msgs Header."""
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    stamp = _new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
+    return _new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+
+def camera_info(
+    camera_matrix: np.ndarray,
+    size: tuple[int, int],
+    stamp_ns: int,
+    frame_id: str,
+    lens: Lens | None = None,
+) -> Any:
+    """A CameraInfo: K and P from the 3 x 3 matrix; D zero unless there is a lens."""
+    matrix = np.asarray(camera_matrix, np.float64)
+    lens = lens or Lens("plumb_bob", (0.0,) * 5)
+    return _new(
+        CAMERA_INFO,
+        header=header(stamp_ns, frame_id),
+        height=size[0],
+        width=size[1],
+        distortion_model=lens.model,
+        d=np.array(lens.coefficients, np.float64),
+        k=matrix.reshape(9),
+        r=np.eye(3).reshape(9),
+        p=np.hstack([matrix, np.zeros((3, 1))]).reshape(12),
+        binning_x=0,
+        binning_y=0,
+        roi=_new(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        ),
+    )
+
+
+def _new(kind: str, **fields: Any) -> Any:
+    return TYPES.types[kind](**fields)
+
+
+def image_message(pixels: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Any:
+    """A raw Image of H x W (x C) pixels, whose dtype must be that of the encoding."""
+    pixels = np.ascontiguousarray(pixels)
+    return _new(
+        IMAGE,
+        header=header(stamp_ns, frame_id),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=pixels.strides[0],
+        data=pixels.view(np.uint8).reshape(-1),
+    )
+
+
+def compressed_message(data: np.ndarray, layout: str, stamp_ns: int, frame_id: str) -> Any:
+    """A CompressedImage of encoded bytes (1-D uint8)."""
+    return _new(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=layout, data=data)
+
+
+def pose_message(pose: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
+    """A PoseStamped of a 4 x 4 camera-to-`frame_id`."""
+    x, y, z = (float(v) for v in pose[:3, 3])
+    position = _new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    placed = _new("geometry_msgs/msg/Pose", position=position, orientation=_quaternion(pose))
+    return _new(POSE, header=header(stamp_ns, frame_id), pose=placed)
+
+
+def transform_message(pose: np.ndarray, stamp_ns: int, parent: str, child: str) -> Any:
+    """A TFMessage of the 4 x 4 that takes points of `child` to `parent`."""
+    x, y, z = (float(v) for v in pose[:3, 3])
+    translation = _new("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+    transform = _new(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        transform=_new(
+            "geometry_msgs/msg/Transform", translation=translation, rotation=_quaternion(pose)
+        ),
+    )
+    return _new(TF, transforms=[transform])
+
+
+def depth_to_millimetres(depth: np.ndarray) -> np.ndarray:
+    """H x W metres -> H x W uint16 millimetres, 0 where there is none or beyond 65.535 m."""
+    millimetres = np.round(np.nan_to_num(depth.astype(np.float64), posinf=0, neginf=0) * 1000)
+    representable = (millimetres > 0) & (millimetres <= np.iinfo(np.uint16).max)
+    return np.where(representable, millimetres, 0).astype(np.uint16)
+
+
+def _quaternion(pose: np.ndarray) -> Any:
+    x, y, z, w = quaternion_from_matrix(pose[:3, :3])
+    return _new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def quaternion_from_matrix(rotation: np.ndarray) -> tuple[float, float, float, float]:
+    """3 x 3 rotation -> unit quaternion (x, y, z, w) with w >= 0.
+
+    The eigenvector of Bar-Itzhack's symmetric 4 x 4 matrix: exact for a rotation, and the
+    nearest one for a matrix with rounding errors.
+    """
+    r = np.asarray(rotation, np.float64)
+    upper = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
+            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(upper)[1][:, -1]  # eigh reads the lower triangle
+    sign = -1.0 if w < 0 else 1.0
+    return sign * float(x), sign * float(y), sign * float(z), sign * float(w)
