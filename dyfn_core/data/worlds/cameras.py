@@ -117,8 +117,13 @@ def random_view(
 ) -> Camera:
     """One camera at head or robot height that looks about level, more often down than up.
 
-    interests: N x 3; half the time one of them is looked at from 0.6 to 4 m.
+    interests: N x 3; two views in three look at one of them from 0.6 to 4 m, or past it: a plant
+    or the back of a chair covers one side, and the room lies behind it.
     """
+    if len(interests) and rng.random() < 0.25:
+        camera = _view_past(space, rng, lens, interests[rng.integers(len(interests))])
+        if camera is not None:
+            return camera
     if len(interests) and rng.random() < 0.65:
         camera = _view_of(space, rng, lens, interests[rng.integers(len(interests))])
         if camera is not None:
@@ -127,6 +132,27 @@ def random_view(
     pitch = np.radians(np.clip(rng.normal(-10, 13), -65, 35))
     roll = np.radians(rng.normal(0, 4))
     return Camera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
+
+
+def _view_past(
+    space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
+) -> Camera | None:
+    """A camera with a point near one side of its picture and free space ahead; None if there is
+    none."""
+    for _ in range(12):
+        reach, around = rng.uniform(0.4, 1.2), rng.uniform(0, 2 * np.pi)
+        offset = np.array([np.cos(around), np.sin(around), 0.0]) * reach
+        position = target + offset + np.array([0, 0, rng.uniform(-0.2, 0.5)])
+        if space.clearance(position[None])[0] < 0.8 * CLEARANCE:
+            continue
+        aside = np.arctan(0.5 / lens.focal[0]) * rng.uniform(0.3, 1.0) * rng.choice([-1, 1])
+        yaw = around + np.pi + aside
+        ahead = np.array([[np.cos(yaw), np.sin(yaw), 0.0]])
+        if space.distance(position[None], ahead)[0] < 2.0:
+            continue
+        pitch, roll = np.radians(rng.normal(-8, 10)), np.radians(rng.normal(0, 4))
+        return Camera(pose_at(position, yaw, pitch, roll), lens.focal)
+    return None
 
 
 def _view_of(

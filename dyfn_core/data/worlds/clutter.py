@@ -201,7 +201,7 @@ def plant(spot: Spot, height: float) -> None:
     pot = float(np.clip(height * rng.uniform(0.2, 0.4), 0.1, 0.6))
     radius = float(np.clip(height * rng.uniform(0.12, 0.2), 0.06, 0.24))
     spot.cylinder((radius * 0.8, radius), pot, textures.muted_color(rng) ** 2, 16)
-    count = int(rng.integers(40, 160))
+    count = int(rng.integers(40, 160) * max(1.0, 1.5 * height))
     turn, rise = rng.uniform(0, 2 * np.pi, count), rng.uniform(0.1, 1.3, count)
     base = rng.uniform(0, 0.55, count) * (height - pot) + pot
     long = (height - pot) * rng.uniform(0.25, 0.5, count)
