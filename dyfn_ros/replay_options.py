@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from dyfn_core.evaluation.predictions import QUANTITIES
+from dyfn_core.prediction import DEPTH
 from dyfn_ros.arguments import above_zero, at_least_one, not_negative
 from dyfn_ros.recordings import image_topics
 from dyfn_ros.replay_outputs import DEFAULT, FILES, VOXEL, parse_outputs
@@ -28,6 +30,7 @@ class Options:
     camera_info_topic: str | None = None
     depth_topic: str | None = None
     prediction_topic: str | None = None
+    quantity: str = DEPTH  # of the prediction topic
     depth_info_topic: str | None = None
     depth_transform: str | None = None
     stamps: Literal["header", "log"] = "header"
@@ -109,6 +112,10 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     given = vars(parser.parse_args(arguments))
     recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
     topics = tuple(given.pop("image_topics"))
+    if given["quantity"] is None:
+        given["quantity"] = DEPTH
+    elif given["prediction_topic"] is None:
+        parser.error("--quantity is of --prediction-topic, which is not given")
     if topics and given["all_topics"]:
         parser.error("--all-topics does not go with --image-topic")
     if len(topics) == 1:
@@ -164,6 +171,12 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--prediction-topic",
         help="score the depth images of this topic, whoever made them, instead of a model's",
+    )
+    add(
+        "--quantity",
+        choices=QUANTITIES,
+        help="what the prediction topic holds. depth (default); disparity: a / depth + b; "
+        "inverse: a / depth",
     )
     add("--depth-info-topic", help="CameraInfo of a depth camera that is not the image's")
     add(

@@ -84,6 +84,7 @@ def _metrics(options: Options, result: Result) -> dict[str, Any]:
             "depth_transform": options.depth_transform,
             "threads": result.threads,
             "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
+            **({} if options.prediction_topic is None else {"predicted": options.quantity}),
         },
     }
 
