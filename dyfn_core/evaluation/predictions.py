@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -49,7 +49,8 @@ class Method(Protocol):
     """What can be scored: one or several predictions of each frame.
 
     quantity: "depth" (scored after scale and shift in depth) or "disparity" (scale and shift in
-    disparity). variants: the predictions' names, the rows of a table.
+    disparity). variants: the predictions' names, the rows of a table. seconds: what every frame
+    so far took, by variant, where the method was run here; empty for files.
     """
 
     @property
@@ -57,6 +58,9 @@ class Method(Protocol):
 
     @property
     def variants(self) -> tuple[str, ...]: ...
+
+    @property
+    def seconds(self) -> Mapping[str, Sequence[float]]: ...
 
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """Begin a sequence; the result takes its frames in order and gives H x W float arrays by
@@ -88,6 +92,11 @@ class ArrayMethod:
     def variants(self) -> tuple[str, ...]:
         """See Method."""
         return (self.name,)
+
+    @property
+    def seconds(self) -> Mapping[str, Sequence[float]]:
+        """See Method."""
+        return {}
 
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """See Method. The result raises FrameError when the arrays end too early."""
