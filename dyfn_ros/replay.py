@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.predictions import scored_quantity
-from dyfn_core.evaluation.protocols import FrameScore, predicted, to_shape
+from dyfn_core.evaluation.protocols import FrameScore, SequenceScorer, predicted, to_shape
 from dyfn_core.evaluation.report import text_table
 from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
 from dyfn_core.prediction import DEPTH
@@ -69,6 +69,8 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
         evaluation = _run(options, recording, model, outputs)
         _require_frames(options, recording, evaluation)
         base = _run_base(options, model) if options.compare else None
+        if options.controls:
+            evaluation.scores.controls |= _run_controls(options, model)
     stabilized = options.stabilizer and model.stabilizer is not None
     result = Result(recording, options.model, stabilized, evaluation, base, threads, outputs.cloud)
     return write_results(options, result)
@@ -174,6 +176,18 @@ def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | No
     if not options.stabilizer or model.stabilizer is None:
         return None
     return _run(replace(options, stabilizer=False), _open(options), model)
+
+
+def _run_controls(options: Options, model: GeometryModel) -> dict[str, SequenceScorer]:
+    """The same frames with each of latent_controls in DyFN's place."""
+    from dyfn_core.evaluation.controls import latent_controls, stabilized_by
+
+    found = {}
+    for name, control in latent_controls(model).items():
+        with stabilized_by(model, control):
+            run = _run(replace(options, stabilizer=True), _open(options), model)
+        found[name] = run.scores.scorer
+    return found
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:

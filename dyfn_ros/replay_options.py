@@ -36,6 +36,7 @@ class Options:
     stamps: Literal["header", "log"] = "header"
     stabilizer: bool = True
     compare: bool = False
+    controls: bool = False
     max_frames: int | None = None
     stride: int = 1
     num_tokens: int | None = None
@@ -116,6 +117,8 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
         given["quantity"] = DEPTH
     elif given["prediction_topic"] is None:
         parser.error("--quantity is of --prediction-topic, which is not given")
+    if given["prediction_topic"] is not None and given["controls"]:
+        parser.error("--controls need a model, --prediction-topic has none")
     if topics and given["all_topics"]:
         parser.error("--all-topics does not go with --image-topic")
     if len(topics) == 1:
@@ -130,6 +133,12 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
     add("--compare", action="store_true", help="also run the base model, for one report on both")
+    add(
+        "--controls",
+        action="store_true",
+        help="also run the model with a moving average of the latent's statistics, and with those "
+        "of the first frame, in DyFN's place; each takes as long as the run itself",
+    )
     add("--num-tokens", type=at_least_one, help="resolution inside the model")
     add("--device", default="cpu", help="cpu, cuda, cuda:N")
     add(

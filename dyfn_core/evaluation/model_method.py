@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
+from dyfn_core.evaluation.controls import latent_controls, stabilized_by
 from dyfn_core.evaluation.predictions import Predict
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.stabilizer import Stabilizer
@@ -46,9 +46,8 @@ class ModelMethod:
             self._stabilizers[f"{name} + DyFN"] = model.stabilizer
         self._stabilizers[f"{name}, base"] = None
         if controls:
-            channels = model.latent_channels
-            self._stabilizers["control: ema"] = ema_control(channels).to(model.device)
-            self._stabilizers["control: frozen"] = frozen_control(channels).to(model.device)
+            found = latent_controls(model)
+            self._stabilizers |= {f"control: {kind}": found[kind] for kind in found}
         self._seconds = {name: array("d") for name in self._stabilizers}
 
     @property

@@ -14,8 +14,11 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from tiny_model import load_tiny
 
+from dyfn_core.evaluation.controls import latent_controls, stabilized_by
+from dyfn_core.evaluation.model_method import as_array
 from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.stream import DepthStream
 from dyfn_ros.messages import cloud_points, decode_depth
 from dyfn_ros.recording_writer import RecordingWriter
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
@@ -290,6 +293,40 @@ def test_every_image_topic_is_a_stream_with_a_folder(tmp_path: Path) -> None:
     run(tmp_path / "walk", tmp_path / "alone", "--image-topic", "/right/image")
     assert metrics(tmp_path / "alone")["output_sha256"] == right["output_sha256"]
     assert left["output_sha256"] != right["output_sha256"]
+
+
+def test_controls_of_the_latent_are_run_when_asked_for(recording: Path, tmp_path: Path) -> None:
+    assert run(recording, tmp_path / "plain", "--write", "none") == ALL
+    assert run(recording, tmp_path / "out", "--write", "none", "--controls") == ALL
+    plain, found = metrics(tmp_path / "plain"), metrics(tmp_path / "out")
+    assert found["output_sha256"] == plain["output_sha256"]
+    controls = found["controls"]
+    assert list(controls) == ["ramp", "constant", "ema", "frozen"]
+    assert {name: controls[name] for name in plain["controls"]} == plain["controls"]
+    model = load_tiny()
+    for name, stabilizer in latent_controls(model).items():
+        scorer = SequenceScorer()
+        with stabilized_by(model, stabilizer):
+            stream = DepthStream(model, CAMERA)
+            for frame in rgbd(5):
+                truth = np.asarray(frame.depth_m, np.float32)
+                said = as_array(stream.push(frame.image, frame.stamp))
+                scorer.push(said, np.where(truth > 0, truth, np.nan))
+        image, video = scorer.image(), scorer.video()
+        assert image is not None and video is not None
+        assert controls[name]["image"] == pytest.approx(image.metrics, rel=1e-6)
+        assert controls[name]["video"] == pytest.approx(video.metrics, rel=1e-6)
+    assert len({controls[name]["video"]["abs_rel"] for name in controls}) == 4
+    assert controls["ema"]["video"] != found["video"] != controls["frozen"]["video"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "control: ema" in page and "moving average" in page
+    assert "control: ema" not in (tmp_path / "plain" / "report.html").read_text()
+
+
+def test_controls_need_a_model(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse(["walk", "--out", "out", "--prediction-topic", "/other/depth", "--controls"])
+    assert "--controls need a model" in capsys.readouterr().err
 
 
 def drifting(truth: np.ndarray, index: int) -> np.ndarray:
