@@ -233,11 +233,12 @@ def decode_colour(raster: Raster) -> np.ndarray:
     return decoder(raster)
 
 
-def decode_metric_depth(raster: Raster) -> np.ndarray:
+def decode_metric_depth(raster: Raster, *, zero: bool = False) -> np.ndarray:
     """-> H x W float32 metres, NaN where there is no depth (REP-118).
 
     16UC1 and mono16 are millimetres, 0 invalid; 32FC1 is metres, where zero, negative and
-    non-finite values are invalid. Raises MessageError as decode_colour does.
+    non-finite values are invalid. zero: a 0 of 32FC1 is valid, as it is of disparity (far away).
+    Raises MessageError as decode_colour does.
     """
     if raster.encoding not in DEPTH_ENCODINGS:
         raise MessageError(
@@ -246,7 +247,9 @@ def decode_metric_depth(raster: Raster) -> np.ndarray:
     _check_size(raster)
     if raster.encoding == "32FC1":
         depth = _rows(raster, "f4", 1)[..., 0].copy()
+        valid = depth >= 0 if zero else depth > 0
     else:
         depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32) * np.float32(0.001)
-    depth[~(np.isfinite(depth) & (depth > 0))] = np.nan
+        valid = depth > 0
+    depth[~(np.isfinite(depth) & valid)] = np.nan
     return depth

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.evaluation.predictions import scored_values
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.projection import back_project, render_depth, resized_camera
+from dyfn_core.prediction import DEPTH, DISPARITY
 from dyfn_ros.calibration import View, undistort_depth
 from dyfn_ros.compressed_depth import decode_compressed_depth
 from dyfn_ros.encodings import MessageError
@@ -24,28 +26,35 @@ class GroundTruth:
     """Decodes one depth or point cloud topic.
 
     transform: pose of its sensor in the image's optical frame; None: the image's own place.
-    warn: takes what had to be assumed.
+    warn: takes what had to be assumed. quantity: what its images hold, one of
+    predictions.QUANTITIES; inverse depth is inverted, disparity stays what it is.
 
     A depth image without CameraInfo, or with the intrinsics and lens of the image, is registered
     already: it shows the image's view, at any resolution. Any other is projected into the image.
     """
 
-    def __init__(self, transform: Transform | None, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        transform: Transform | None,
+        warn: Callable[[str], None],
+        quantity: str = DEPTH,
+    ) -> None:
         self._transform = transform
         self._warn = warn
+        self._quantity = quantity
 
     def decode(self, recorded: Recorded, info: Any, view: View, frame_id: str) -> np.ndarray:
         """H x W float32 metres along the optical axis of the view, NaN where there is none.
 
         info: CameraInfo of the depth image, or None. view, frame_id: the image's. The result has
         the view's aspect ratio when it was projected, see register_depth.
-        Raises MessageError when the message is no depth, or intrinsics that are needed are absent.
+        Raises MessageError when the message is no depth, intrinsics that are needed are absent, or
+        disparity, whose points are not known, would have to be projected.
         """
         message = recorded.message()
         if recorded.kind == POINT_CLOUD:
             return self._cloud(message, view, frame_id)
-        compressed = recorded.kind == COMPRESSED_IMAGE
-        depth = decode_compressed_depth(message) if compressed else decode_depth(message)
+        depth = self._image(message, recorded.kind == COMPRESSED_IMAGE)
         calibration = self._calibration(info, depth)
         if self._transform is not None and (calibration is None or view.matrix is None):
             raise MessageError("a transform needs the intrinsics of the image and of the depth")
@@ -53,12 +62,23 @@ class GroundTruth:
             return undistort_depth(depth, view)
         if self._transform is None and _same_camera(calibration, depth, view):
             return undistort_depth(depth, view)
+        if self._quantity == DISPARITY:
+            raise MessageError(
+                "disparity of another camera than the image's (by its CameraInfo) cannot be "
+                "projected into the image; register it before it is recorded"
+            )
         self._check_place(message, frame_id, "at the image's optical centre")
         if calibration.distorted:
             lens = View(np.empty((*depth.shape, 0)), calibration.matrix, lens=calibration)
             depth = undistort_depth(depth, lens)
         size = (view.image.shape[0], view.image.shape[1])
         return register_depth(depth, calibration.matrix, view.matrix, size, self._transform)
+
+    def _image(self, message: Any, compressed: bool) -> np.ndarray:
+        if compressed:
+            return scored_values(decode_compressed_depth(message), self._quantity)
+        stored = decode_depth(message, zero=self._quantity == DISPARITY)
+        return scored_values(stored, self._quantity)
 
     def _cloud(self, message: Any, view: View, frame_id: str) -> np.ndarray:
         if view.matrix is None:

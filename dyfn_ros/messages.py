@@ -66,9 +66,12 @@ def decode_image(message: Any) -> np.ndarray:
     return decode_colour(_raster(message))
 
 
-def decode_depth(message: Any) -> np.ndarray:
-    """sensor_msgs/Image with depth -> H x W float32 metres, NaN invalid. Raises MessageError."""
-    return decode_metric_depth(_raster(message))
+def decode_depth(message: Any, *, zero: bool = False) -> np.ndarray:
+    """sensor_msgs/Image with depth -> H x W float32 metres, NaN invalid. Raises MessageError.
+
+    zero: see decode_metric_depth.
+    """
+    return decode_metric_depth(_raster(message), zero=zero)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+from dyfn_core.prediction import DEPTH
 from dyfn_ros.metric_messages import parse_pose
 from dyfn_ros.recorded import Recorded
 from dyfn_ros.recorded_frames import Notes, RecordedFrame, Recording
@@ -27,6 +28,7 @@ from dyfn_ros.topics import Topics, choose_topics
 from dyfn_ros.topics import image_topics as list_image_topics
 
 __all__ = [
+    "FolderRecording",
     "RecordedFrame",
     "Recording",
     "RecordingError",
@@ -48,6 +50,7 @@ def open_recording(
     depth_info_topic: str | None = None,
     depth_transform: str | None = None,
     stamps: Literal["header", "log"] = "header",
+    quantity: str = DEPTH,
 ) -> Recording:
     """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, or an RGB-D folder.
 
@@ -56,6 +59,7 @@ def open_recording(
     depth_transform: 'x y z qx qy qz qw', pose of the depth camera or the point cloud's sensor in
     the image's optical frame; None: at its optical centre. tolerance: seconds between the stamps
     of an image and its ground truth. stamps: "header", or "log" for the time of recording.
+    quantity: what the depth topic's images hold, see GroundTruth.
     Raises RecordingError: not a recording, nothing readable, no image topic, or several
     candidates, which are then listed with their types; ValueError for wrong options.
     """
@@ -76,7 +80,11 @@ def open_recording(
                 f"{path}: a depth transform needs the CameraInfo of {topics.depth}; name it with "
                 "--depth-info-topic"
             )
-    return RosRecording(path, storage, topics, tolerance, transform, stamps)
+    if quantity != DEPTH and topics.depth and storage.topics[topics.depth].kind == POINT_CLOUD:
+        raise RecordingError(
+            f"{path}: {topics.depth} is {POINT_CLOUD}, expected images of {quantity}"
+        )
+    return RosRecording(path, storage, topics, tolerance, transform, stamps, quantity)
 
 
 def image_topics(path: str | Path) -> list[str | None]:

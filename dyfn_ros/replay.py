@@ -15,11 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.protocols import to_shape
+from dyfn_core.evaluation.predictions import scored_quantity
+from dyfn_core.evaluation.protocols import FrameScore, SequenceScorer, predicted, to_shape
 from dyfn_core.evaluation.report import text_table
 from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
+from dyfn_core.prediction import DEPTH
 from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
-from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
+from dyfn_ros.recordings import (
+    FolderRecording,
+    RecordedFrame,
+    Recording,
+    RecordingError,
+    open_recording,
+)
 from dyfn_ros.replay_options import Command, Options, parse, split
 from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
 from dyfn_ros.replay_results import Result, results_by_name, write_results
@@ -44,8 +52,8 @@ def load(name: str, device: str) -> GeometryModel:
 def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     """Replay one image topic and write everything into options.out; -> metrics.json's content.
 
-    With a prediction_topic no model runs: its depth images are scored. Raises RecordingError for
-    a recording that cannot be used, OutputError for a file that cannot be written, and what
+    With a prediction_topic no model runs: its images are scored. Raises RecordingError for a
+    recording that cannot be used, OutputError for a file that cannot be written, and what
     load_model raises.
     """
     recording = _open(options)
@@ -61,6 +69,8 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
         evaluation = _run(options, recording, model, outputs)
         _require_frames(options, recording, evaluation)
         base = _run_base(options, model) if options.compare else None
+        if options.controls:
+            evaluation.scores.controls |= _run_controls(options, model)
     stabilized = options.stabilizer and model.stabilizer is not None
     result = Result(recording, options.model, stabilized, evaluation, base, threads, outputs.cloud)
     return write_results(options, result)
@@ -73,28 +83,81 @@ def _require_frames(options: Options, recording: Recording, evaluation: Sequence
 
 
 def score_topic(options: Options, recording: Recording) -> SequenceEvaluation:
-    """The depth that some method recorded on prediction_topic, matched and registered as truth is.
+    """What some method recorded on prediction_topic, matched and registered as truth is.
 
-    Images without a prediction are counted in the recording's warnings and cover nothing.
+    Its quantity is aligned as `dyfn-eval score` aligns that of files. Images without a prediction
+    cover nothing; they, and predictions that cannot be read, are noted with the recording.
+    Raises RecordingError: no such topic, the ground truth's own, another field of view than the
+    images, or not one usable prediction.
     """
-    topic = options.prediction_topic
-    other = replace(options, depth_topic=topic, depth_info_topic=None, depth_transform=None)
+    other = replace(
+        options, depth_topic=options.prediction_topic, depth_info_topic=None, depth_transform=None
+    )
+    predicted_by = _open(other, options.quantity)
+    topic = _prediction_topic(options, recording, predicted_by)
     frames, expected = _frames(options, recording)
-    predictions, _ = _frames(other, _open(other))
-    evaluation = SequenceEvaluation(expected, options.depth_max)
-    for frame, predicted in zip(frames, predictions, strict=True):
-        said = predicted.depth
-        if said is None:
-            recording.notes.warnings[f"{topic}: no prediction for an image"] += 1
-            said = np.full(frame.image.shape[:2], np.nan, np.float32)
-        said = to_shape(said, frame.image.shape[:2])
-        valid = np.isfinite(said) & (said > 0)
-        stamp = frame.stamp_ns * 1e-9
-        evaluation.push(frame.image, said, valid, frame.depth, stamp=stamp, latency=0.0)
+    predictions, _ = _frames(other, predicted_by)
+    quantity = scored_quantity(options.quantity)
+    evaluation = SequenceEvaluation(expected, options.depth_max, quantity)
+    found = 0
+    for frame, prediction in zip(frames, predictions, strict=True):
+        found += prediction.depth is not None
+        said = _at_size(topic, prediction.depth, frame.image)
+        stamp, valid = frame.stamp_ns * 1e-9, predicted(said, quantity)
+        _push(evaluation, recording, frame, (said, valid), stamp, latency=0.0)
+    recording.notes.losses |= predicted_by.notes.losses
+    recording.notes.warnings |= predicted_by.notes.warnings
+    if evaluation.frames and not found:
+        reasons = "; ".join(predicted_by.notes.losses) or "none has the stamp of an image"
+        raise RecordingError(f"{options.recording}: {topic}: no usable prediction: {reasons}")
     return evaluation
 
 
-def _open(options: Options) -> Recording:
+def _prediction_topic(options: Options, recording: Recording, predicted_by: Recording) -> str:
+    """As it is recorded. Raises RecordingError when its scores would say nothing."""
+    topic = predicted_by.topics.depth
+    if isinstance(recording, FolderRecording) or topic is None:
+        raise RecordingError(
+            f"{options.recording}: expected a recording with a topic "
+            f"{options.prediction_topic} of predictions"
+        )
+    if topic == recording.topics.depth:
+        raise RecordingError(
+            f"{options.recording}: {topic} is the prediction and the ground truth; name another "
+            'with --depth-topic, or "none" for no scores'
+        )
+    return topic
+
+
+def _at_size(topic: str, said: np.ndarray | None, image: np.ndarray) -> np.ndarray:
+    """H x W of the image; all NaN when nothing was said."""
+    height, width = image.shape[:2]
+    if said is None:
+        return np.full((height, width), np.nan, np.float32)
+    try:
+        return to_shape(said, (height, width))
+    except ValueError:
+        raise RecordingError(
+            f"{topic}: {said.shape[1]} x {said.shape[0]} pixels do not show the same field of "
+            f"view as images of {width} x {height}"
+        ) from None
+
+
+def _push(
+    evaluation: SequenceEvaluation,
+    recording: Recording,
+    frame: RecordedFrame,
+    said: tuple[np.ndarray, np.ndarray],
+    stamp: float,
+    latency: float,
+) -> FrameScore:
+    try:
+        return evaluation.push(frame.image, *said, frame.depth, stamp=stamp, latency=latency)
+    except ValueError as error:
+        raise RecordingError(f"{recording.topics.depth}: {error}") from error
+
+
+def _open(options: Options, quantity: str = DEPTH) -> Recording:
     return open_recording(
         options.recording,
         options.image_topic,
@@ -104,6 +167,7 @@ def _open(options: Options) -> Recording:
         depth_info_topic=options.depth_info_topic,
         depth_transform=options.depth_transform,
         stamps=options.stamps,
+        quantity=quantity,
     )
 
 
@@ -112,6 +176,18 @@ def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | No
     if not options.stabilizer or model.stabilizer is None:
         return None
     return _run(replace(options, stabilizer=False), _open(options), model)
+
+
+def _run_controls(options: Options, model: GeometryModel) -> dict[str, SequenceScorer]:
+    """The same frames with each of latent_controls in DyFN's place."""
+    from dyfn_core.evaluation.controls import latent_controls, stabilized_by
+
+    found = {}
+    for name, control in latent_controls(model).items():
+        with stabilized_by(model, control):
+            run = _run(replace(options, stabilizer=True), _open(options), model)
+        found[name] = run.scores.scorer
+    return found
 
 
 def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
@@ -151,17 +227,8 @@ def _run(
                 )
             )
             latency = time.perf_counter() - start
-            try:
-                # Disparity is aligned as such, also where its inverse is too far to be depth.
-                score = evaluation.push(
-                    frame.image,
-                    *geometry.said,
-                    frame.depth,
-                    stamp=stamp,
-                    latency=latency,
-                )
-            except ValueError as error:
-                raise RecordingError(f"{recording.topics.depth}: {error}") from error
+            # Disparity is aligned as such, also where its inverse is too far to be depth.
+            score = _push(evaluation, recording, frame, geometry.said, stamp, latency)
             if outputs is not None:
                 outputs.write(frame, geometry, score)
         if outputs is not None:

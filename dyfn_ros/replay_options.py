@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from dyfn_core.evaluation.predictions import QUANTITIES
+from dyfn_core.prediction import DEPTH
 from dyfn_ros.arguments import above_zero, at_least_one, not_negative
 from dyfn_ros.recordings import image_topics
 from dyfn_ros.replay_outputs import DEFAULT, FILES, VOXEL, parse_outputs
@@ -28,11 +30,13 @@ class Options:
     camera_info_topic: str | None = None
     depth_topic: str | None = None
     prediction_topic: str | None = None
+    quantity: str = DEPTH  # of the prediction topic
     depth_info_topic: str | None = None
     depth_transform: str | None = None
     stamps: Literal["header", "log"] = "header"
     stabilizer: bool = True
     compare: bool = False
+    controls: bool = False
     max_frames: int | None = None
     stride: int = 1
     num_tokens: int | None = None
@@ -109,6 +113,12 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     given = vars(parser.parse_args(arguments))
     recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
     topics = tuple(given.pop("image_topics"))
+    if given["quantity"] is None:
+        given["quantity"] = DEPTH
+    elif given["prediction_topic"] is None:
+        parser.error("--quantity is of --prediction-topic, which is not given")
+    if given["prediction_topic"] is not None and given["controls"]:
+        parser.error("--controls need a model, --prediction-topic has none")
     if topics and given["all_topics"]:
         parser.error("--all-topics does not go with --image-topic")
     if len(topics) == 1:
@@ -123,6 +133,12 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
     add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
     add("--compare", action="store_true", help="also run the base model, for one report on both")
+    add(
+        "--controls",
+        action="store_true",
+        help="also run the model with a moving average of the latent's statistics, and with those "
+        "of the first frame, in DyFN's place; each takes as long as the run itself",
+    )
     add("--num-tokens", type=at_least_one, help="resolution inside the model")
     add("--device", default="cpu", help="cpu, cuda, cuda:N")
     add(
@@ -164,6 +180,12 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
     add(
         "--prediction-topic",
         help="score the depth images of this topic, whoever made them, instead of a model's",
+    )
+    add(
+        "--quantity",
+        choices=QUANTITIES,
+        help="what the prediction topic holds. depth (default); disparity: a / depth + b; "
+        "inverse: a / depth",
     )
     add("--depth-info-topic", help="CameraInfo of a depth camera that is not the image's")
     add(

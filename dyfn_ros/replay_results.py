@@ -22,6 +22,12 @@ if TYPE_CHECKING:
     from dyfn_ros.replay_options import Options
 
 
+CONTROLS_NOTE = (
+    " The others put a moving average of the latent's statistics (ema), or those of the first "
+    "frame (frozen), in DyFN's place."
+)
+
+
 @dataclass(frozen=True)
 class Result:
     """A replay that has ended.
@@ -84,6 +90,7 @@ def _metrics(options: Options, result: Result) -> dict[str, Any]:
             "depth_transform": options.depth_transform,
             "threads": result.threads,
             "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
+            **({} if options.prediction_topic is None else {"predicted": options.quantity}),
         },
     }
 
@@ -112,7 +119,7 @@ def _write_report(path: Path, options: Options, metrics: dict[str, Any], result:
     if result.base is not None:
         runs[run_name({**metrics, "stabilizer": False})] = result.base
     clouds = {} if result.cloud is None else {f"{name}, fused, from above": result.cloud}
-    sections = sequence_sections(runs, clouds)
+    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if options.controls else "")
     if notes:
         rows = [[text, count] for text, count in notes.items()]
         sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dyfn_core.prediction import DEPTH
 from dyfn_ros.calibration import CalibrationRules, Calibrator, View
 from dyfn_ros.compressed_image import decode_compressed
 from dyfn_ros.depth_matching import Stamped, match_depth
@@ -34,6 +35,7 @@ class RosRecording:
         tolerance: float,
         transform: Transform | None = None,
         stamps: Literal["header", "log"] = "header",
+        quantity: str = DEPTH,
     ) -> None:
         self.path = path
         self.topics = topics
@@ -41,7 +43,7 @@ class RosRecording:
         self._rules = CalibrationRules()
         self._storage = storage
         self._tolerance_ns = round(tolerance * 1e9)
-        self._truth = GroundTruth(transform, self._assumed)
+        self._truth = GroundTruth(transform, self._assumed, quantity)
         self._log_time = stamps == "log"
 
     @property

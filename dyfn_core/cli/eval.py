@@ -17,6 +17,7 @@ from typing import Any
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval_arguments import add_benchmark, add_model, add_predictions
 from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmark_pictures import BenchmarkPictures
 from dyfn_core.evaluation.benchmark_report import write_benchmark_report
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate
 from dyfn_core.evaluation.benchmark_table import write_json, write_results
@@ -140,16 +141,20 @@ def _scoring(options: argparse.Namespace, temporal: bool) -> Scoring:
 
 def _evaluate(options: argparse.Namespace) -> int:
     opened = _open(options)
+    method = _method(options)
+    pictures = BenchmarkPictures([one.name for one in opened.sequences], method.quantity)
     results = evaluate(
         opened,
-        _method(options),
+        method,
         _scoring(options, options.temporal),
         allow_missing=options.allow_missing,
         note=_note,
+        pictures=pictures,
     )
     results = {**_provenance(options), **results}
     table = write_results(results, options.out, _title(opened), options.ablations)
-    write_benchmark_report(options.out / "report.html", _title(opened), table, results)
+    path = options.out / "report.html"
+    write_benchmark_report(path, _title(opened), table, results, pictures, method.seconds)
     return _finish(text_table(table), results, options.out)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmark_pictures import BenchmarkPictures, SequencePictures
 from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Opened
 from dyfn_core.evaluation.predictions import Method, Predict
 from dyfn_core.evaluation.protocols import (
@@ -54,6 +55,11 @@ class VariantScorers:
         self.scorers = {v: scoring.scorer(depth_max, method.quantity) for v in method.variants}
         self.scorers |= {f"control: {c}": scoring.scorer(depth_max, DEPTH) for c in CONTROLS}
 
+    @property
+    def first(self) -> SequenceScorer:
+        """Of the method's first variant, which the pictures are of."""
+        return self.scorers[self.method.variants[0]]
+
     def push(self, found: Mapping[str, np.ndarray], truth: np.ndarray) -> dict[str, np.ndarray]:
         """One frame's predictions by variant; returns all maps that were scored, at truth's size.
 
@@ -71,15 +77,21 @@ class VariantScorers:
 
 
 def score_sequence(
-    sequence: BenchmarkSequence, method: Method, depth_max: float, scoring: Scoring
+    sequence: BenchmarkSequence,
+    method: Method,
+    depth_max: float,
+    scoring: Scoring,
+    pictures: BenchmarkPictures | None = None,
 ) -> dict[str, Any]:
-    """Everything about one sequence, as plain values.
+    """Everything about one sequence, as plain values. pictures: takes some of its frames.
 
     Raises FrameError or DataError, naming the file or sequence and what was expected.
     """
     scorers = VariantScorers(method, depth_max, scoring)
+    taken = None if pictures is None else pictures.begin(sequence)
     with TemporalScorer() as temporal:
-        frames = _push_all(sequence, method.open(sequence), scorers, temporal, scoring, depth_max)
+        steady = temporal if scoring.temporal else None
+        frames = _push_all(sequence, method.open(sequence), scorers, depth_max, steady, taken)
         variants = {name: _summary(scorer) for name, scorer in scorers.scorers.items()}
         steadiness: dict[str, Any] = {}
         if scoring.temporal:
@@ -92,6 +104,8 @@ def score_sequence(
                     if found["alignment"] is not None
                 }
             )
+    if pictures is not None and taken is not None:
+        pictures.finish(taken, scorers.first.video())
     for name, found in variants.items():
         found["temporal"] = steadiness.get(name)
     return {
@@ -110,9 +124,9 @@ def _push_all(
     sequence: BenchmarkSequence,
     predict: Predict,
     scorers: VariantScorers,
-    temporal: TemporalScorer,
-    scoring: Scoring,
     depth_max: float,
+    temporal: TemporalScorer | None,
+    taken: SequencePictures | None,
 ) -> int:
     count = 0
     for count, frame in enumerate(sequence.frames(), start=1):
@@ -121,9 +135,12 @@ def _push_all(
             maps = scorers.push(found, frame.truth)
         except ValueError as error:
             raise FrameError(f"{sequence.name}, frame {count - 1}: {error}") from error
-        if scoring.temporal:
-            truth = np.where(frame.truth <= depth_max, frame.truth, np.float32(np.nan))
+        truth = np.where(frame.truth <= depth_max, frame.truth, np.float32(np.nan))
+        if temporal is not None:
             temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
+        if taken is not None:
+            said = maps[scorers.method.variants[0]]
+            taken.add(count - 1, frame.image, said, truth, scorers.first.frames[-1])
     return count
 
 
@@ -165,18 +182,19 @@ def evaluate(
     *,
     allow_missing: bool = False,
     note: Note = lambda line: None,
+    pictures: BenchmarkPictures | None = None,
 ) -> dict[str, Any]:
     """All sequences and their means, as plain values: what results.json holds.
 
     allow_missing: a sequence that cannot be scored is listed under `missing` and the others go on;
-    otherwise its error ends it. note: is told a line a sequence. Raises DataError when no sequence
-    could be scored.
+    otherwise its error ends it. note: is told a line a sequence. pictures: takes some frames.
+    Raises DataError when no sequence could be scored.
     """
     scoring = scoring or Scoring()
     done, missing = [], list(opened.missing)
     for sequence in opened.sequences:
         try:
-            found = score_sequence(sequence, method, opened.settings.depth_max, scoring)
+            found = score_sequence(sequence, method, opened.settings.depth_max, scoring, pictures)
         except (FrameError, DataError) as error:
             if not allow_missing:
                 raise

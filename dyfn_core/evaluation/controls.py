@@ -57,6 +57,15 @@ def frozen_control(channels: int) -> StatisticsControl:
     return StatisticsControl(channels, 0.0)
 
 
+def latent_controls(model: GeometryModel) -> dict[str, Stabilizer]:
+    """What the model's own stabilizer is compared with, by name, on the model's device."""
+    channels = model.latent_channels
+    return {
+        "ema": ema_control(channels).to(model.device),
+        "frozen": frozen_control(channels).to(model.device),
+    }
+
+
 @contextlib.contextmanager
 def stabilized_by(model: GeometryModel, stabilizer: Stabilizer | None) -> Iterator[GeometryModel]:
     """Inside, the model has this stabilizer (or none); afterwards its own again."""
@@ -107,8 +116,7 @@ def _score_sequence(
 ) -> dict[str, VariantScore]:
     stabilizers: dict[str, Stabilizer | None] = {
         "base": None,
-        "ema": ema_control(model.latent_channels),
-        "frozen": frozen_control(model.latent_channels),
+        **latent_controls(model),
     }
     if model.stabilizer is not None:
         stabilizers["dyfn"] = model.stabilizer

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from array import array
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import torch
 
 from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
+from dyfn_core.evaluation.controls import latent_controls, stabilized_by
 from dyfn_core.evaluation.predictions import Predict
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.stabilizer import Stabilizer
@@ -20,7 +24,8 @@ class ModelMethod:
     stabilize: False leaves the DyFN variant out. controls: False leaves the moving average and the
     frozen statistics out. num_tokens: None for the model's default. known_camera: tell the stream
     the benchmark's intrinsics; otherwise, as in the paper, it finds the focal length itself.
-    The image is encoded once for all variants; each has a DepthStream of its own.
+    The image is encoded once for all variants; each has a DepthStream of its own, and the encoding
+    counts in the time of each.
     """
 
     def __init__(
@@ -41,9 +46,9 @@ class ModelMethod:
             self._stabilizers[f"{name} + DyFN"] = model.stabilizer
         self._stabilizers[f"{name}, base"] = None
         if controls:
-            channels = model.latent_channels
-            self._stabilizers["control: ema"] = ema_control(channels).to(model.device)
-            self._stabilizers["control: frozen"] = frozen_control(channels).to(model.device)
+            found = latent_controls(model)
+            self._stabilizers |= {f"control: {kind}": found[kind] for kind in found}
+        self._seconds = {name: array("d") for name in self._stabilizers}
 
     @property
     def quantity(self) -> str:
@@ -55,6 +60,11 @@ class ModelMethod:
         """See predictions.Method."""
         return tuple(self._stabilizers)
 
+    @property
+    def seconds(self) -> Mapping[str, Sequence[float]]:
+        """See predictions.Method."""
+        return self._seconds
+
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """See predictions.Method; every sequence begins with fresh streams."""
         streams: dict[str, DepthStream] = {}
@@ -63,14 +73,20 @@ class ModelMethod:
         def predict(index: int, frame: BenchmarkFrame) -> dict[str, np.ndarray]:
             if not streams:
                 streams.update(self._streams(frame))
+            start = time.perf_counter()
             image = torch.from_numpy(np.ascontiguousarray(frame.image)).permute(2, 0, 1)[None]
             latent = self.model.encode(image.to(self.model.device).float() / 255, self.num_tokens)
+            if self.model.device.type == "cuda":
+                torch.cuda.synchronize(self.model.device)  # or the first variant would wait for it
+            encoding = time.perf_counter() - start
             found = {}
             for name, stream in streams.items():
+                start = time.perf_counter()
                 with stabilized_by(self.model, self._stabilizers[name]):
                     changed, state = self.model.stabilize_latent(latent, stream.memory.state)
                 affine = self.model.decode(changed)
                 found[name] = as_array(stream.finish(affine, state, float(index)))
+                self._seconds[name].append(encoding + time.perf_counter() - start)
             return found
 
         return predict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -26,11 +26,31 @@ Predict = Callable[[int, BenchmarkFrame], Mapping[str, np.ndarray]]
 OpenArrays = Callable[[BenchmarkSequence], Iterator[np.ndarray]]
 
 
+def scored_quantity(kind: str) -> str:
+    """How values of one of QUANTITIES are aligned: disparity as such, the others as depth."""
+    if kind not in QUANTITIES:
+        raise DataError(f"quantity {kind!r} is unknown, expected one of {QUANTITIES}")
+    return DISPARITY if kind == DISPARITY else DEPTH
+
+
+def scored_values(values: np.ndarray, kind: str) -> np.ndarray:
+    """Values of one of QUANTITIES -> what scored_quantity says, float32 of the same shape.
+
+    Inverse depth has no unknown offset and becomes depth, NaN where it is not positive.
+    """
+    values = np.asarray(values, np.float32)
+    if kind != INVERSE:
+        return values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(values > 0, 1 / values, np.float32(np.nan))
+
+
 class Method(Protocol):
     """What can be scored: one or several predictions of each frame.
 
     quantity: "depth" (scored after scale and shift in depth) or "disparity" (scale and shift in
-    disparity). variants: the predictions' names, the rows of a table.
+    disparity). variants: the predictions' names, the rows of a table. seconds: what every frame
+    so far took, by variant, where the method was run here; empty for files.
     """
 
     @property
@@ -38,6 +58,9 @@ class Method(Protocol):
 
     @property
     def variants(self) -> tuple[str, ...]: ...
+
+    @property
+    def seconds(self) -> Mapping[str, Sequence[float]]: ...
 
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """Begin a sequence; the result takes its frames in order and gives H x W float arrays by
@@ -58,18 +81,22 @@ class ArrayMethod:
     open_arrays: OpenArrays
 
     def __post_init__(self) -> None:
-        if self.kind not in QUANTITIES:
-            raise DataError(f"quantity {self.kind!r} is unknown, expected one of {QUANTITIES}")
+        scored_quantity(self.kind)  # raises
 
     @property
     def quantity(self) -> str:
         """See Method."""
-        return DISPARITY if self.kind == DISPARITY else DEPTH
+        return scored_quantity(self.kind)
 
     @property
     def variants(self) -> tuple[str, ...]:
         """See Method."""
         return (self.name,)
+
+    @property
+    def seconds(self) -> Mapping[str, Sequence[float]]:
+        """See Method."""
+        return {}
 
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """See Method. The result raises FrameError when the arrays end too early."""
@@ -81,11 +108,7 @@ class ArrayMethod:
                 raise FrameError(
                     f"{sequence.name}: {self.name} ends after {index} of {len(sequence)} frames"
                 )
-            values = np.asarray(values, np.float32)
-            if self.kind == INVERSE:
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    values = np.where(values > 0, 1 / values, np.float32(np.nan))
-            return {self.name: values}
+            return {self.name: scored_values(values, self.kind)}
 
         return predict
 

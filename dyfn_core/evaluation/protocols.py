@@ -229,7 +229,8 @@ CONTROLS: dict[str, Callable[[tuple[int, int]], np.ndarray]] = {"ramp": ramp, "c
 class ControlledScorer:
     """A SequenceScorer with the controls scored beside it on the same pixels.
 
-    Print the floors with every result: a low error of an easy scene proves nothing.
+    Print the floors with every result: a low error of an easy scene proves nothing. controls:
+    by name; others of the same frames may be added when all of these are pushed.
     """
 
     def __init__(
@@ -250,8 +251,8 @@ class ControlledScorer:
         valid = predicted(prediction, self.scorer.quantity)
         if mask is not None:
             valid &= mask
-        for name, scorer in self.controls.items():
-            scorer.push(CONTROLS[name](target.shape), target, valid)
+        for name, control in CONTROLS.items():
+            self.controls[name].push(control((target.shape[0], target.shape[1])), target, valid)
         return self.scorer.push(prediction, target, valid)
 
 

@@ -100,10 +100,7 @@ class SequenceEvaluation:
 
     def latency_ms(self) -> dict[str, float] | None:
         """Median and 99th percentile of the latency; None without frames."""
-        if not self._latencies:
-            return None
-        p50, p99 = np.percentile(np.array(self._latencies) * 1000, [50, 99])
-        return {"p50": float(p50), "p99": float(p99)}
+        return latency_marks(self.column("latency_ms"))
 
     def video(self) -> SequenceScore | None:
         """The sequence under the video protocol."""
@@ -157,6 +154,14 @@ class SequenceEvaluation:
         """The strip, aligned as the video protocol does (H x W x 3 uint8 RGB)."""
         video = self.video()
         return self.strip.draw(1, 0) if video is None else self.strip.draw(video.scale, video.shift)
+
+
+def latency_marks(milliseconds: np.ndarray) -> dict[str, float] | None:
+    """Median and 99th percentile of times; None without any."""
+    if not milliseconds.size:
+        return None
+    p50, p99 = np.percentile(milliseconds, [50, 99])
+    return {"p50": float(p50), "p99": float(p99)}
 
 
 def _means(score: SequenceScore | None) -> dict[str, float] | None:

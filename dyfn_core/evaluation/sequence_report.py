@@ -20,6 +20,7 @@ from dyfn_core.evaluation.report import (
 )
 from dyfn_core.evaluation.sequence import (
     SequenceEvaluation,
+    latency_marks,
     over_median,
     score_table,
 )
@@ -28,7 +29,7 @@ SCORE_NOTE = (
     "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
     "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
     "shift for the whole sequence. Scale spread: standard deviation of the log of each frame's "
-    "own scale. The controls know nothing of the image: a vertical ramp and a constant."
+    "own scale. Two controls know nothing of the image: a vertical ramp and a constant."
 )
 WORST_NOTE = (
     "Worst by AbsRel under the video protocol, one of each stretch of the recording. The pictures "
@@ -62,7 +63,7 @@ def sequence_sections(
             for name, cloud in (clouds or {}).items()
         ),
         *(section for name, run in runs.items() for section in _worst(name, run)),
-        _latency(runs),
+        latency_section({name: run.column("latency_ms") for name, run in runs.items()}),
     ]
 
 
@@ -116,11 +117,17 @@ def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
     return [Section(f"Worst frames, {name}", parts)]
 
 
-def _latency(runs: Mapping[str, SequenceEvaluation]) -> Section:
-    marks = {name: run.latency_ms() or {} for name, run in runs.items()}
+def latency_section(milliseconds: Mapping[str, np.ndarray]) -> Section:
+    """Histogram, percentiles and frames a second. milliseconds: name -> times of all frames."""
+    marks = {name: latency_marks(values) or {} for name, values in milliseconds.items()}
     rows: list[list[Cell]] = [
-        [name, *(f"{value:.1f}" for value in found.values())] for name, found in marks.items()
+        [name, *(f"{value:.1f}" for value in found.values()), _rate(found.get("p50"))]
+        for name, found in marks.items()
     ]
-    values = {name: run.column("latency_ms") for name, run in runs.items()}
-    histogram = Histogram("Time per frame", values, "ms", marks)
-    return Section("Latency", [histogram, Table(("", "p50 ms", "p99 ms"), rows)])
+    histogram = Histogram("Time per frame", milliseconds, "ms", marks)
+    header = ("", "p50 ms", "p99 ms", "frames a second (p50)")
+    return Section("Latency", [histogram, Table(header, rows)])
+
+
+def _rate(milliseconds: float | None) -> Cell:
+    return f"{1000 / milliseconds:.1f}" if milliseconds else None

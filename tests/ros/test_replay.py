@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,11 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from tiny_model import load_tiny
 
+from dyfn_core.evaluation.controls import latent_controls, stabilized_by
+from dyfn_core.evaluation.model_method import as_array
 from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.stream import DepthStream
 from dyfn_ros.messages import cloud_points, decode_depth
 from dyfn_ros.recording_writer import RecordingWriter
 from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
@@ -291,8 +295,48 @@ def test_every_image_topic_is_a_stream_with_a_folder(tmp_path: Path) -> None:
     assert left["output_sha256"] != right["output_sha256"]
 
 
-def other_method(path: Path) -> list[RgbdFrame]:
-    """A camera, its truth, and another node's depth that drifts; that node missed the second."""
+def test_controls_of_the_latent_are_run_when_asked_for(recording: Path, tmp_path: Path) -> None:
+    assert run(recording, tmp_path / "plain", "--write", "none") == ALL
+    assert run(recording, tmp_path / "out", "--write", "none", "--controls") == ALL
+    plain, found = metrics(tmp_path / "plain"), metrics(tmp_path / "out")
+    assert found["output_sha256"] == plain["output_sha256"]
+    controls = found["controls"]
+    assert list(controls) == ["ramp", "constant", "ema", "frozen"]
+    assert {name: controls[name] for name in plain["controls"]} == plain["controls"]
+    model = load_tiny()
+    for name, stabilizer in latent_controls(model).items():
+        scorer = SequenceScorer()
+        with stabilized_by(model, stabilizer):
+            stream = DepthStream(model, CAMERA)
+            for frame in rgbd(5):
+                truth = np.asarray(frame.depth_m, np.float32)
+                said = as_array(stream.push(frame.image, frame.stamp))
+                scorer.push(said, np.where(truth > 0, truth, np.nan))
+        image, video = scorer.image(), scorer.video()
+        assert image is not None and video is not None
+        assert controls[name]["image"] == pytest.approx(image.metrics, rel=1e-6)
+        assert controls[name]["video"] == pytest.approx(video.metrics, rel=1e-6)
+    assert len({controls[name]["video"]["abs_rel"] for name in controls}) == 4
+    assert controls["ema"]["video"] != found["video"] != controls["frozen"]["video"]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "control: ema" in page and "moving average" in page
+    assert "control: ema" not in (tmp_path / "plain" / "report.html").read_text()
+
+
+def test_controls_need_a_model(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse(["walk", "--out", "out", "--prediction-topic", "/other/depth", "--controls"])
+    assert "--controls need a model" in capsys.readouterr().err
+
+
+def drifting(truth: np.ndarray, index: int) -> np.ndarray:
+    return (truth * 0.5 + 0.2) * 1.2**index
+
+
+def other_method(
+    path: Path, says: Callable[[np.ndarray, int], np.ndarray] = drifting
+) -> list[RgbdFrame]:
+    """A camera, its truth, and what another node says of it; that node missed the second."""
     frames = rgbd(4)
     with RecordingWriter(path) as writer:
         for index, frame in enumerate(frames):
@@ -303,8 +347,8 @@ def other_method(path: Path) -> list[RgbdFrame]:
             writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "camera")
             writer.write_depth("/camera/depth", truth, stamp, "camera")
             if index != 1:
-                said = (truth * 0.5 + 0.2) * 1.2**index
-                writer.write_depth("/other/depth", np.where(truth > 0, said, 0), stamp, "camera")
+                said = np.where(truth > 0, says(np.where(truth > 0, truth, 1), index), np.nan)
+                writer.write_depth("/other/depth", said, stamp, "camera")
     return frames
 
 
@@ -315,11 +359,11 @@ def test_another_methods_topic_is_scored_as_it_stands(tmp_path: Path) -> None:
     assert run(tmp_path / "walk", out, *topics) == ALL
     found = metrics(out)
     assert (found["frames"], found["model"], found["stabilizer"]) == (4, "/other/depth", False)
-    assert found["recording"]["warnings"] == {"/other/depth: no prediction for an image": 1}
+    assert found["recording"]["warnings"] == {"/other/depth: no depth at an image's stamp": 1}
     scorer = SequenceScorer()
     for index, frame in enumerate(frames):
         truth = np.asarray(frame.depth_m)
-        said = (truth * 0.5 + 0.2) * 1.2**index
+        said = drifting(truth, index)
         known = (truth > 0) & (index != 1)
         scorer.push(np.where(known, said, np.nan), np.where(truth > 0, truth, np.nan))
     image, video = scorer.image(), scorer.video()
@@ -328,6 +372,113 @@ def test_another_methods_topic_is_scored_as_it_stands(tmp_path: Path) -> None:
     assert found["video"]["abs_rel"] == pytest.approx(video.metrics["abs_rel"], abs=1e-6)
     assert found["video"]["abs_rel"] > 0.05 > found["image"]["abs_rel"]
     assert "/other/depth" in (out / "report.html").read_text()
+
+
+TOPICS = ("--depth-topic", "/camera/depth", "--prediction-topic", "/other/depth")
+
+
+@pytest.mark.parametrize(
+    ("quantity", "says"),
+    [
+        ("inverse", lambda truth, index: 3 / truth),
+        ("disparity", lambda truth, index: 2 / truth + 0.7),
+    ],
+)
+def test_another_methods_topic_may_hold_inverse_depth_or_disparity(
+    quantity: str, says: Callable[[np.ndarray, int], np.ndarray], tmp_path: Path
+) -> None:
+    other_method(tmp_path / "walk", says)
+    assert run(tmp_path / "walk", tmp_path / "out", *TOPICS, "--quantity", quantity) == ALL
+    found = metrics(tmp_path / "out")
+    assert found["quantity"] == ("disparity" if quantity == "disparity" else "depth")
+    assert found["options"]["predicted"] == quantity
+    assert found["video"]["abs_rel"] < 1e-5 and found["video"]["delta1"] == 1
+    scale, shift = (1 / 2, -0.7 / 2) if quantity == "disparity" else (3, 0)
+    assert found["alignment"] == pytest.approx({"scale": scale, "shift": shift}, abs=1e-4)
+    assert run(tmp_path / "walk", tmp_path / "depth", *TOPICS) == ALL
+    assert metrics(tmp_path / "depth")["video"]["abs_rel"] > 0.05
+
+
+def rewrite(old: Path, new: Path, change: Callable[[Any], None]) -> None:
+    """The same recording, but for what `change` does to the messages of /other/depth."""
+    with RecordingWriter(new) as writer, Reader(old) as reader:
+        for connection, stamp, data in reader.messages():
+            message = TYPES.deserialize_cdr(data, connection.msgtype)
+            if connection.topic == "/other/depth":
+                change(message)
+            writer.write(connection.topic, connection.msgtype, message, stamp)
+
+
+def test_disparity_0_of_a_topic_is_far_away_and_of_depth_nothing(tmp_path: Path) -> None:
+    def says(truth: np.ndarray, index: int) -> np.ndarray:
+        return np.where(truth > 3, np.nan, 1 / truth - 1 / 3)
+
+    def nothing_is_0(message: Any) -> None:
+        message.data = np.nan_to_num(message.data.view(np.float32)).view(np.uint8)
+
+    other_method(tmp_path / "nan", says)
+    rewrite(tmp_path / "nan", tmp_path / "walk", nothing_is_0)
+    coverage = {}
+    for quantity in ("depth", "inverse", "disparity"):
+        assert run(tmp_path / "walk", tmp_path / quantity, *TOPICS, "--quantity", quantity) == ALL
+        coverage[quantity] = metrics(tmp_path / quantity)["coverage"]
+    assert coverage["disparity"] == 1
+    assert coverage["depth"] == coverage["inverse"] < 0.95
+
+
+def test_disparity_of_another_camera_is_refused_and_inverse_depth_projected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = CAMERA * [[0.5], [0.5], [1]]  # sees twice as far to the sides
+    with RecordingWriter(tmp_path / "walk") as writer:
+        for stamp in (1_000_000_000, 2_000_000_000):
+            writer.write_image("/camera/image", np.zeros((*SIZE, 3), np.uint8), stamp, "camera")
+            writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "camera")
+            writer.write_depth("/camera/depth", np.full(SIZE, 2.0), stamp, "camera")
+            writer.write_camera_info("/other/camera_info", camera, SIZE, stamp, "camera")
+            writer.write_depth("/other/depth", np.full(SIZE, 0.5), stamp, "camera")
+    out = tmp_path / "out"
+    assert run(tmp_path / "walk", out, *TOPICS, "--quantity", "inverse") == ALL
+    assert metrics(out)["video"]["abs_rel"] < 1e-6
+    capsys.readouterr()
+    assert run(tmp_path / "walk", out, *TOPICS, "--quantity", "disparity") == UNUSABLE
+    error = capsys.readouterr().err
+    assert "/other/depth: no usable prediction: " in error and "cannot be projected" in error
+
+
+def test_predictions_that_cannot_be_read_are_losses(tmp_path: Path) -> None:
+    def broken(message: Any) -> None:
+        if message.header.stamp.sec == 3:
+            message.encoding = "8UC1"
+
+    other_method(tmp_path / "walk")
+    rewrite(tmp_path / "walk", tmp_path / "broken", broken)
+    assert run(tmp_path / "broken", tmp_path / "out", *TOPICS) == PARTIAL
+    (loss,) = metrics(tmp_path / "out")["recording"]["losses"]
+    assert loss.startswith("/other/depth: depth skipped: ") and "8UC1" in loss
+
+
+def test_a_prediction_is_not_scored_against_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other_method(tmp_path / "walk")
+    itself = ("--prediction-topic", "/other/depth", "--depth-topic", "/other/depth")
+    assert run(tmp_path / "walk", tmp_path / "out", *itself) == UNUSABLE
+    assert "is the prediction and the ground truth" in capsys.readouterr().err
+    folder = tmp_path / "folder"
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+        kind = np.uint8 if name == "rgb" else np.uint16
+        cv2.imwrite(str(folder / name / "0.png"), np.full((8, 8), 100, kind))
+    (folder / "K.txt").write_text("8 0 4\n0 8 4\n0 0 1\n")
+    assert run(folder, tmp_path / "out", *itself[:2]) == UNUSABLE
+    assert "expected a recording with a topic /other/depth" in capsys.readouterr().err
+
+
+def test_a_quantity_needs_a_prediction_topic(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parse(["walk", "--out", "out", "--quantity", "inverse"])
+    assert "--quantity is of --prediction-topic" in capsys.readouterr().err
 
 
 def test_a_prediction_topic_that_is_not_there_is_named(

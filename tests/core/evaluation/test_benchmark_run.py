@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import torch
 from made_benchmarks import PATCH, depth, make_scannet, make_sintel, make_tum, make_video
 
 from dyfn_core.cli import eval as cli
+from dyfn_core.evaluation.benchmark_pictures import STRIPS, WORST, BenchmarkPictures
 from dyfn_core.evaluation.benchmark_run import Scoring, evaluate, mean_of
 from dyfn_core.evaluation.benchmark_table import HEADER
 from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Settings, open_benchmark
@@ -25,6 +28,7 @@ from dyfn_core.evaluation.protocols import LEAST_SQUARES, SequenceScorer, least_
 from dyfn_core.evaluation.published import published, published_rows
 from dyfn_core.evaluation.report import Table
 from dyfn_core.evaluation.tables import csv_table, latex_table, markdown_table
+from dyfn_core.evaluation.worst_frames import WIDTH
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.stream import DepthStream
 
@@ -73,6 +77,13 @@ def test_files_are_scored_by_value(tmp_path: Path, capsys: pytest.CaptureFixture
     page = (out / "report.html").read_text()
     assert page.count("<svg") == 3 and "http" not in page
     assert "Over time, rgbd_dataset_freiburg1_made" in page and str(folder) in page
+    assert page.count("data:image/jpeg") == 2  # strip, worst frames
+    errors = read(out)["sequences"][0]["over_time"]["mine"]["video_abs_rel"]
+    worst = int(np.argmax(errors))
+    first = page[page.index("<th>worst first") :].split("<tr>")[1]
+    assert f"<td>{worst}</td>" in first and f"{errors[worst]:.3f}" in first
+    assert f"<td>frame {worst}</td>" in first  # is in the picture
+    assert "Latency" not in page  # nothing was run
     printed = capsys.readouterr().out
     for row in ("mine", "control: ramp", "control: constant", "ground truth"):
         assert row in printed
@@ -161,6 +172,10 @@ def test_a_model_runs_as_its_stream_does(tmp_path: Path, pinhole_with_dyfn: Geom
             wanted = as_array(stream.push(frame.image, float(index)))
             np.testing.assert_array_equal(found[name], wanted)
     assert not np.array_equal(found["m + DyFN"], found["m, base"])
+    assert {name: len(times) for name, times in method.seconds.items()} == dict.fromkeys(
+        method.variants, len(sequence)
+    )
+    assert all(second > 0 for times in method.seconds.values() for second in times)
 
 
 def test_controls_of_the_latent_are_streams_with_that_stabilizer(
@@ -193,6 +208,12 @@ def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
         assert cli.main([*arguments, str(tmp_path / "out")]) == 3
         files = sorted((tmp_path / "out").iterdir())
         texts.append({path.name: path.read_text() for path in files})
+    pages = [text["report.html"] for text in texts]
+    assert pages[0].count("frames a second") == 1
+    for text, page in zip(texts, pages, strict=True):  # all but times are the same
+        latency = re.compile("<section[^>]*><h2>Latency.*?</section>", re.DOTALL)
+        text["report.html"] = latency.sub("", page)
+        assert text["report.html"] != page
     assert texts[0] == texts[1]
     assert set(texts[0]) == {"results.json", "report.html"} | {
         f"{stem}.{kind}" for stem in ("table", "sequences") for kind in ("md", "csv", "tex")
@@ -210,6 +231,32 @@ def test_the_bundled_model_writes_the_same_files_twice(tmp_path: Path) -> None:
     results = json.loads(texts[0]["results.json"])
     assert results["layout"] == "depthcrafter" and results["versions"]["numpy"] == np.__version__
     assert results["options"]["model"] == "dyfn-mini"
+
+
+def test_pictures_are_few_however_many_sequences_and_the_worst_are_the_runs(
+    tmp_path: Path,
+) -> None:
+    opened = open_benchmark("tum", room(tmp_path))
+    names = [f"room {n}" for n in range(40)]
+    many = replace(opened, sequences=[replace(opened.sequences[0], name=name) for name in names])
+    rough = {"room 7": 2, "room 31": 4}  # sequence -> the frame that is off
+
+    def says(sequence: BenchmarkSequence) -> Iterator[np.ndarray]:
+        for i in range(6):
+            yield depth(i, TUM) * (1.3 if rough.get(sequence.name) == i else 1)
+
+    pictures = BenchmarkPictures(names, "depth")
+    evaluate(many, ArrayMethod("m", "depth", says), Scoring(temporal=False), pictures=pictures)
+    assert len(pictures.strips) == STRIPS and {"room 0", "room 39"} <= set(pictures.strips)
+    assert len(pictures.worst) == WORST
+    found = {(frame.sequence, frame.frame) for frame in pictures.worst[:2]}
+    assert found == set(rough.items())
+    assert all(frame.shown == frame.frame for frame in pictures.worst[:2])
+    assert pictures.worst[1].abs_rel > 0.1 > 0.01 > pictures.worst[2].abs_rel
+    numbers = opened.sequences[0].numbers
+    assert all(frame.number == numbers[frame.frame] for frame in pictures.worst)
+    strip = pictures.strips["room 0"]
+    assert strip.shape[1] == 4 * (WIDTH + 2)  # input, truth, depth, error
 
 
 def moving_scale(sequence: BenchmarkSequence) -> Iterator[np.ndarray]:
