@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dyfn_core.models.exact import Pointwise
 from dyfn_core.prediction import StreamState
 
 EPSILON = 1e-5
@@ -182,8 +183,8 @@ class ConvGRUStabilizer(Stabilizer):
     def __init__(self, channels: int, config: StabilizerConfig) -> None:
         super().__init__(channels, config)
         self.conv_gru_cell = ConvGRUCell(channels, config.hidden)
-        self.gamma_head = nn.Conv2d(config.hidden, channels, 1)
-        self.beta_head = nn.Conv2d(config.hidden, channels, 1)
+        self.gamma_head = Pointwise(config.hidden, channels)
+        self.beta_head = Pointwise(config.hidden, channels)
         nn.init.zeros_(self.gamma_head.weight)
         nn.init.zeros_(self.beta_head.weight)
         nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
