@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.exact import pointwise
+from dyfn_core.models.exact import convolve
 
 BATCH_NORM_EPS = 1e-3
 IMAGE_MEAN = 127 / 255
@@ -69,7 +69,6 @@ class NormalisedConv(nn.Module):
         self.stride, self.groups = stride, groups
         self.padding = kernel // 2 if stride == 1 else 0
         before = (kernel - stride) // 2
-        self.is_pointwise = kernel == stride == groups == 1
         self.border = (before, kernel - stride - before) * 2 if stride > 1 else None
         self.weight = nn.Parameter(torch.empty(cout, cin // groups, kernel, kernel))
         nn.init.kaiming_normal_(self.weight, mode="fan_out")
@@ -80,11 +79,9 @@ class NormalisedConv(nn.Module):
         weight: Tensor = self.weight
         if self.scale is not None:
             weight = weight * self.scale[:, None, None, None]
-        if self.is_pointwise:
-            return pointwise(x, weight, self.bias)
         if self.border is not None:
             x = F.pad(x, self.border)
-        return F.conv2d(x, weight, self.bias, self.stride, self.padding, groups=self.groups)
+        return convolve(x, weight, self.bias, self.stride, self.padding, self.groups)
 
     @torch.no_grad()
     def fold(self) -> None:

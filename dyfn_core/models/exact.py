@@ -1,10 +1,10 @@
 """Layers whose result has the same bits on any number of CPU threads, and alone or in a batch.
 
-On the CPU torch picks another library for some of these operations when it has one thread or one
-image, and MKL splits small products among its threads: the sums are then taken in another order.
-Here every such product is oneDNN's convolution of 1 x 1, whose threads share out the outputs and
-never one sum, and small channel counts are resized plane by plane. The values differ from those of
-torch.nn in the last bits only. On other devices and dtypes these are torch's own.
+On the CPU torch picks another library for a convolution when it has one thread, or one small image,
+and MKL splits the sums of small matrix products among its threads: the order of the sums changes.
+Here every product is a convolution of oneDNN, whose threads share out the outputs and never one
+sum; norms run on planes, and few channels are resized plane by plane. The values differ from those
+of torch.nn in the last bits only. On other devices and dtypes these are torch's own.
 """
 
 from __future__ import annotations
@@ -16,15 +16,18 @@ from torch import Tensor, nn
 FEW_CHANNELS = 4  # below, torch's resize adds up in another order on another number of threads
 
 
-class Pointwise(nn.Conv2d):
-    """nn.Conv2d of 1 x 1, stride 1, no padding; the same parameters."""
-
-    def __init__(self, cin: int, cout: int) -> None:
-        super().__init__(cin, cout, 1)
+class Conv2d(nn.Conv2d):
+    """nn.Conv2d without dilation and with padding in numbers; the same parameters."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """x: B x cin x h x w -> B x cout x h x w."""
-        return pointwise(x, self.weight, self.bias)
+        """x: B x C x h x w -> B x C' x h' x w'."""
+        if not _is_onednn(x, self.weight):
+            return super().forward(x)
+        padding = (int(self.padding[0]), int(self.padding[1]))
+        if self.padding_mode != "zeros" and padding != (0, 0):
+            x = F.pad(x, (padding[1], padding[1], padding[0], padding[0]), mode=self.padding_mode)
+            padding = (0, 0)
+        return convolve(x, self.weight, self.bias, self.stride[0], padding, self.groups)
 
 
 class GroupNorm(nn.GroupNorm):
@@ -36,28 +39,42 @@ class GroupNorm(nn.GroupNorm):
 
 
 class Linear(nn.Linear):
-    """nn.Linear on tokens; the same parameters."""
+    """nn.Linear on tokens or rows; the same parameters."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """x: B x n x cin -> B x n x cout."""
+        """x: B x n x C, or n x C -> the same with C' in place of C."""
         if not _is_onednn(x, self.weight):
-            return F.linear(x, self.weight, self.bias)
-        pixels = x.transpose(1, 2)[:, :, None]  # tokens are pixels whose channels lie together
-        weight = self.weight[:, :, None, None]
-        return pointwise(pixels, weight, self.bias)[:, :, 0].transpose(1, 2)
+            return super().forward(x)
+        if x.dim() == 2:
+            pixels = x[..., None, None]
+        else:
+            pixels = x.transpose(1, 2)[:, :, None]  # pixels whose channels lie together
+        out = convolve(pixels, self.weight[:, :, None, None], self.bias)
+        return out[..., 0, 0] if x.dim() == 2 else out[:, :, 0].transpose(1, 2)
 
 
-def pointwise(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """A convolution of 1 x 1: x B x cin x h x w, weight cout x cin x 1 x 1 -> B x cout x h x w."""
+def convolve(
+    x: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    stride: int = 1,
+    padding: int | tuple[int, int] = 0,
+    groups: int = 1,
+) -> Tensor:
+    """F.conv2d: x B x C x h x w, weight C' x C/groups x k x k -> B x C' x h' x w'."""
     if not _is_onednn(x, weight):
-        return F.conv2d(x, weight, bias)
-    if x.shape[-2:] == (1, 1):  # oneDNN splits the sum when there are few outputs
+        return F.conv2d(x, weight, bias, stride, padding, groups=groups)
+    pad = (padding, padding) if isinstance(padding, int) else padding
+    is_pointwise = weight.shape[-2:] == (1, 1) and stride == groups == 1 and pad == (0, 0)
+    if is_pointwise and x.shape[-2:] == (1, 1):  # oneDNN splits a sum when there are few outputs
         sums = (x[:, None, :, 0, 0] * weight[:, :, 0, 0]).sum(dim=-1)
         return (sums if bias is None else sums + bias)[..., None, None]
-    # oneDNN leaves planes to a matrix product that splits sums; pixels it does itself.
-    pixels = x.contiguous(memory_format=torch.channels_last)
-    out: Tensor = torch.ops.aten.mkldnn_convolution(pixels, weight, bias, (0, 0), (1, 1), (1, 1), 1)
-    return out.contiguous() if x.is_contiguous() else out
+    # Planes of 1 x 1 oneDNN leaves to a matrix product that splits sums; pixels it does itself.
+    source = x.contiguous(memory_format=torch.channels_last) if is_pointwise else x
+    out: Tensor = torch.ops.aten.mkldnn_convolution(
+        source, weight, bias, pad, (stride, stride), (1, 1), groups
+    )
+    return out.contiguous() if is_pointwise and x.is_contiguous() else out
 
 
 def resize(x: Tensor, size: tuple[int, int], align_corners: bool = False) -> Tensor:

@@ -23,7 +23,7 @@ from dyfn_core.models.efficientnet import (
     EfficientNetLite0,
     imagenet_weights,
 )
-from dyfn_core.models.exact import GroupNorm, Linear, Pointwise, resize
+from dyfn_core.models.exact import Conv2d, GroupNorm, Linear, resize
 
 CELL = 16  # pixels along the side of one token of the budget
 MULTIPLE = 32  # network sizes are multiples of the encoder's largest stride
@@ -67,9 +67,9 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.norm = GroupNorm(channels, channels)
-        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.first = Conv2d(channels, channels, 3, padding=1, bias=False)
         self.norm_second = GroupNorm(channels, channels)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        self.second = Conv2d(channels, channels, 3, padding=1)
         nn.init.normal_(self.second.weight, std=1e-2)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
@@ -84,7 +84,7 @@ class ContextLayer(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.position = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
+        self.position = Conv2d(channels, channels, 3, padding=1, groups=channels)
         self.norm_attention = nn.LayerNorm(channels)
         self.qkv = Linear(channels, 3 * channels)
         self.out = Linear(channels, channels)
@@ -111,7 +111,7 @@ class Neck(nn.Module):
     def __init__(self, config: MiniConfig) -> None:
         super().__init__()
         fine, middle, deep = FEATURE_CHANNELS
-        self.context_in = Pointwise(deep, config.context_channels)
+        self.context_in = Conv2d(deep, config.context_channels, 1)
         self.context = nn.Sequential(
             *(
                 ContextLayer(config.context_channels, config.context_heads)
@@ -119,9 +119,9 @@ class Neck(nn.Module):
             )
         )
         channels = config.latent_channels
-        self.project_fine = Pointwise(fine, channels)
-        self.project_middle = Pointwise(middle, channels)
-        self.project_deep = Pointwise(config.context_channels, channels)
+        self.project_fine = Conv2d(fine, channels, 1)
+        self.project_middle = Conv2d(middle, channels, 1)
+        self.project_deep = Conv2d(config.context_channels, channels, 1)
         self.refine_middle = ResidualBlock(channels) if config.refine else nn.Identity()
         self.refine_fine = ResidualBlock(channels) if config.refine else nn.Identity()
 
@@ -145,20 +145,20 @@ class Decoder(nn.Module):
         joins, stages = [], []
         channels = config.latent_channels
         for width in config.stage_channels:
-            joins.append(Pointwise(channels + 2, width))
+            joins.append(Conv2d(channels + 2, width, 1))
             stages.append(ResidualBlock(width))
             channels = width
         self.joins, self.stages = nn.ModuleList(joins), nn.ModuleList(stages)
-        out = Pointwise(32, 3 * 4)
+        out = Conv2d(32, 3 * 4, 1)
         nn.init.normal_(out.weight, std=1e-2)
         nn.init.zeros_(out.bias)  # type: ignore[arg-type]
         self.points = nn.Sequential(
-            nn.Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
+            Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
         )
         self.mask = nn.Sequential(
-            nn.Conv2d(channels + 2, 16, 3, padding=1),
+            Conv2d(channels + 2, 16, 3, padding=1),
             nn.LeakyReLU(SLOPE),
-            Pointwise(16, 4),
+            Conv2d(16, 4, 1),
             nn.PixelShuffle(2),
         )
 
