@@ -108,4 +108,4 @@ class DPTHead(nn.Module):
 
 def resized(x: Tensor, size: tuple[int, ...]) -> Tensor:
     """B x C x h x w -> B x C x size, bilinear between corners that stay corners."""
-    return resize(x, (size[0], size[1]), align_corners=True)
+    return resize(x, size, align_corners=True)

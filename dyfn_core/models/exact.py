@@ -45,12 +45,11 @@ class Linear(nn.Linear):
         """x: B x n x C, or n x C -> the same with C' in place of C."""
         if not _is_onednn(x, self.weight):
             return super().forward(x)
+        weight = self.weight[:, :, None, None]
         if x.dim() == 2:
-            pixels = x[..., None, None]
-        else:
-            pixels = x.transpose(1, 2)[:, :, None]  # pixels whose channels lie together
-        out = convolve(pixels, self.weight[:, :, None, None], self.bias)
-        return out[..., 0, 0] if x.dim() == 2 else out[:, :, 0].transpose(1, 2)
+            return convolve(x[:, :, None, None], weight, self.bias)[:, :, 0, 0]
+        pixels = x.transpose(1, 2)[:, :, None]  # channels lie together: channels_last already
+        return convolve(pixels, weight, self.bias)[:, :, 0].transpose(1, 2)
 
 
 def convolve(
@@ -70,21 +69,29 @@ def convolve(
         sums = (x[:, None, :, 0, 0] * weight[:, :, 0, 0]).sum(dim=-1)
         return (sums if bias is None else sums + bias)[..., None, None]
     # Planes of 1 x 1 oneDNN leaves to a matrix product that splits sums; pixels it does itself.
-    source = x.contiguous(memory_format=torch.channels_last) if is_pointwise else x
+    source = _channels_last(x) if is_pointwise or x.stride(1) == 1 else x
     out: Tensor = torch.ops.aten.mkldnn_convolution(
         source, weight, bias, pad, (stride, stride), (1, 1), groups
     )
     return out.contiguous() if is_pointwise and x.is_contiguous() else out
 
 
-def resize(x: Tensor, size: tuple[int, int], align_corners: bool = False) -> Tensor:
+def _channels_last(x: Tensor) -> Tensor:
+    """x in channels_last; the strides of a batch of one also say so, which views may have hidden."""
+    x = x.contiguous(memory_format=torch.channels_last)
+    if x.stride(0) * len(x) == x.numel():
+        return x
+    return x[0].permute(1, 2, 0)[None].permute(0, 3, 1, 2)
+
+
+def resize(x: Tensor, size: tuple[int, ...], align_corners: bool = False) -> Tensor:
     """Bilinear: x B x C x h x w -> B x C x H x W; x itself when it has that size."""
     if tuple(x.shape[-2:]) == tuple(size):
         return x
     batch, channels, height, width = x.shape
     if channels < FEW_CHANNELS:
         x = x.reshape(batch * channels, 1, height, width)
-    x = F.interpolate(x, size, mode="bilinear", align_corners=align_corners)
+    x = F.interpolate(x, tuple(size), mode="bilinear", align_corners=align_corners)
     return x.reshape(batch, channels, *size)
 
 
