@@ -77,7 +77,7 @@ def convolve(
 
 
 def _channels_last(x: Tensor) -> Tensor:
-    """x in channels_last; the strides of a batch of one also say so, which views may have hidden."""
+    """x in channels_last, also by its strides, which views may have hidden in a batch of one."""
     x = x.contiguous(memory_format=torch.channels_last)
     if x.stride(0) * len(x) == x.numel():
         return x
