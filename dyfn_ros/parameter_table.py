@@ -52,7 +52,7 @@ class Settings(MetricSettings):
     threads: int = _parameter(
         _NODE,
         THREADS,
-        "CPU threads for inference, to which the last bits of depth belong; 0 leaves torch's own.",
+        "CPU threads for inference; depth does not depend on them; 0 leaves torch's own.",
         range=(0, 1024),
     )
     batch: bool = _parameter(

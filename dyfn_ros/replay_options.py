@@ -145,7 +145,7 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         "--threads",
         type=not_negative,
         default=THREADS,
-        help="CPU threads for inference, to which the last bits of the result belong "
+        help="CPU threads for inference, on which the result does not depend "
         f"(default: {THREADS}; 0: torch's own choice)",
     )
     add(

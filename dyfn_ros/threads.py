@@ -1,12 +1,12 @@
-"""How many CPU threads compute: a part of the result, to the last bits of it."""
+"""How many CPU threads compute."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# The same for the node and for dyfn-replay, whatever the machine has: the libraries under torch
-# sum in another order on another number of threads.
+# The same for the node and for dyfn-replay, whatever the machine has. The bundled models do not
+# depend on it (dyfn_core.models.exact); a model made of torch's own layers may.
 THREADS = 2
 
 

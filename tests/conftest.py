@@ -21,5 +21,5 @@ def shared_dir() -> Path:
 
 @pytest.fixture(autouse=True)
 def same_threads() -> None:
-    """Training sets the process's thread count, and the last bits of a result depend on it."""
+    """Training sets the process's thread count, and the last bits of a gradient depend on it."""
     torch.set_num_threads(THREADS)

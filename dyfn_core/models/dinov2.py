@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dyfn_core.models.exact import Conv2d, Linear
+
 PATCH = 14
 TRAINED_GRID = 37
 # Released weights are resized with this offset on the token count; it must stay.
@@ -26,7 +28,7 @@ class PatchEmbedding(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, channels, PATCH, stride=PATCH)
+        self.proj = Conv2d(3, channels, PATCH, stride=PATCH)
 
     def forward(self, image: Tensor) -> Tensor:
         """image: H and W multiples of 14."""
@@ -39,8 +41,8 @@ class Attention(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.proj = nn.Linear(channels, channels)
+        self.qkv = Linear(channels, 3 * channels)
+        self.proj = Linear(channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""
@@ -55,8 +57,8 @@ class FeedForward(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.fc1 = nn.Linear(channels, 4 * channels)
-        self.fc2 = nn.Linear(4 * channels, channels)
+        self.fc1 = Linear(channels, 4 * channels)
+        self.fc2 = Linear(4 * channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""

@@ -16,6 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dyfn_core.models.exact import convolve
+
 BATCH_NORM_EPS = 1e-3
 IMAGE_MEAN = 127 / 255
 IMAGE_STD = 128 / 255
@@ -79,7 +81,7 @@ class NormalisedConv(nn.Module):
             weight = weight * self.scale[:, None, None, None]
         if self.border is not None:
             x = F.pad(x, self.border)
-        return F.conv2d(x, weight, self.bias, self.stride, self.padding, groups=self.groups)
+        return convolve(x, weight, self.bias, self.stride, self.padding, self.groups)
 
     @torch.no_grad()
     def fold(self) -> None:

@@ -23,6 +23,7 @@ from dyfn_core.models.efficientnet import (
     EfficientNetLite0,
     imagenet_weights,
 )
+from dyfn_core.models.exact import Conv2d, GroupNorm, Linear, resize
 
 CELL = 16  # pixels along the side of one token of the budget
 MULTIPLE = 32  # network sizes are multiples of the encoder's largest stride
@@ -65,10 +66,10 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(channels, channels)
-        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm_second = nn.GroupNorm(channels, channels)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1)
+        self.norm = GroupNorm(channels, channels)
+        self.first = Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm_second = GroupNorm(channels, channels)
+        self.second = Conv2d(channels, channels, 3, padding=1)
         nn.init.normal_(self.second.weight, std=1e-2)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
@@ -83,13 +84,13 @@ class ContextLayer(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.position = nn.Conv2d(channels, channels, 3, padding=1, groups=channels)
+        self.position = Conv2d(channels, channels, 3, padding=1, groups=channels)
         self.norm_attention = nn.LayerNorm(channels)
-        self.qkv = nn.Linear(channels, 3 * channels)
-        self.out = nn.Linear(channels, channels)
+        self.qkv = Linear(channels, 3 * channels)
+        self.out = Linear(channels, channels)
         self.norm_mlp = nn.LayerNorm(channels)
         self.mlp = nn.Sequential(
-            nn.Linear(channels, 2 * channels), nn.GELU(), nn.Linear(2 * channels, channels)
+            Linear(channels, 2 * channels), nn.GELU(), Linear(2 * channels, channels)
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -110,7 +111,7 @@ class Neck(nn.Module):
     def __init__(self, config: MiniConfig) -> None:
         super().__init__()
         fine, middle, deep = FEATURE_CHANNELS
-        self.context_in = nn.Conv2d(deep, config.context_channels, 1)
+        self.context_in = Conv2d(deep, config.context_channels, 1)
         self.context = nn.Sequential(
             *(
                 ContextLayer(config.context_channels, config.context_heads)
@@ -118,9 +119,9 @@ class Neck(nn.Module):
             )
         )
         channels = config.latent_channels
-        self.project_fine = nn.Conv2d(fine, channels, 1)
-        self.project_middle = nn.Conv2d(middle, channels, 1)
-        self.project_deep = nn.Conv2d(config.context_channels, channels, 1)
+        self.project_fine = Conv2d(fine, channels, 1)
+        self.project_middle = Conv2d(middle, channels, 1)
+        self.project_deep = Conv2d(config.context_channels, channels, 1)
         self.refine_middle = ResidualBlock(channels) if config.refine else nn.Identity()
         self.refine_fine = ResidualBlock(channels) if config.refine else nn.Identity()
 
@@ -130,9 +131,9 @@ class Neck(nn.Module):
         )
         size = fine.shape[-2:]
         deep = self.project_deep(self.context(self.context_in(deep)))
-        coarse = self.project_middle(middle) + _resize(deep, middle.shape[-2:])
+        coarse = self.project_middle(middle) + resize(deep, middle.shape[-2:])
         coarse = self.refine_middle(coarse)
-        latent: Tensor = self.refine_fine(self.project_fine(fine) + _resize(coarse, size))
+        latent: Tensor = self.refine_fine(self.project_fine(fine) + resize(coarse, size))
         return latent
 
 
@@ -144,20 +145,20 @@ class Decoder(nn.Module):
         joins, stages = [], []
         channels = config.latent_channels
         for width in config.stage_channels:
-            joins.append(nn.Conv2d(channels + 2, width, 1))
+            joins.append(Conv2d(channels + 2, width, 1))
             stages.append(ResidualBlock(width))
             channels = width
         self.joins, self.stages = nn.ModuleList(joins), nn.ModuleList(stages)
-        out = nn.Conv2d(32, 3 * 4, 1)
+        out = Conv2d(32, 3 * 4, 1)
         nn.init.normal_(out.weight, std=1e-2)
         nn.init.zeros_(out.bias)  # type: ignore[arg-type]
         self.points = nn.Sequential(
-            nn.Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
+            Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
         )
         self.mask = nn.Sequential(
-            nn.Conv2d(channels + 2, 16, 3, padding=1),
+            Conv2d(channels + 2, 16, 3, padding=1),
             nn.LeakyReLU(SLOPE),
-            nn.Conv2d(16, 4, 1),
+            Conv2d(16, 4, 1),
             nn.PixelShuffle(2),
         )
 
@@ -166,7 +167,7 @@ class Decoder(nn.Module):
         for index, (join, stage) in enumerate(zip(self.joins, self.stages, strict=True)):
             x = join(_with_view_plane(x, aspect))
             if index > 0:
-                x = _resize(x, (x.shape[-2] * 2, x.shape[-1] * 2))
+                x = resize(x, (x.shape[-2] * 2, x.shape[-1] * 2))
             x = stage(x)
         x = _with_view_plane(x, aspect)
         points = self.points(x)
@@ -257,8 +258,8 @@ class MiniModel(GeometryModel):
     def decode(self, latent: Latent) -> AffinePoints:
         """Latent -> affine-invariant points at latent.image_size."""
         points, mask = self.decode_raw(latent)
-        points = _resize(points, latent.image_size)
-        mask = _resize(mask[:, None], latent.image_size)[:, 0]
+        points = resize(points, latent.image_size)
+        mask = resize(mask[:, None], latent.image_size)[:, 0]
         return AffinePoints(remap_exp(points.float()), mask.float())
 
 
@@ -269,12 +270,6 @@ def remap_exp(raw: Tensor) -> Tensor:
     """
     z = raw[:, 2:].clamp(-RAW_LIMIT, RAW_LIMIT).exp()
     return torch.cat([raw[:, :2] * z, z], dim=1).permute(0, 2, 3, 1)
-
-
-def _resize(x: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
-    if tuple(x.shape[-2:]) == tuple(size):
-        return x
-    return F.interpolate(x, tuple(size), mode="bilinear", align_corners=False)
 
 
 def _view_plane(like: Tensor, aspect: float) -> Tensor:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from dyfn_core.geometry.camera import uv_grid
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
+from dyfn_core.models.exact import Conv2d, GroupNorm, resize
 from dyfn_core.prediction import StreamState
 
 REMAPS = ("linear", "sinh", "exp", "sinh_exp")
@@ -72,12 +73,12 @@ class ResidualBlock(nn.Module):
         super().__init__()
         groups = hidden // 32 if norm == "group_norm" else 1
         self.layers = nn.Sequential(
-            nn.GroupNorm(1, channels),
+            GroupNorm(1, channels),
             nn.ReLU(),
-            nn.Conv2d(channels, hidden, 3, padding=1, padding_mode="replicate"),
-            nn.GroupNorm(groups, hidden),
+            Conv2d(channels, hidden, 3, padding=1, padding_mode="replicate"),
+            GroupNorm(groups, hidden),
             nn.ReLU(),
-            nn.Conv2d(hidden, channels, 3, padding=1, padding_mode="replicate"),
+            Conv2d(hidden, channels, 3, padding=1, padding_mode="replicate"),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -91,7 +92,7 @@ class Head(nn.Module):
     def __init__(self, config: MoGeConfig, num_features: int, encoder_channels: int) -> None:
         super().__init__()
         self.projects = nn.ModuleList(
-            nn.Conv2d(encoder_channels, config.dim_proj, 1) for _ in range(num_features)
+            Conv2d(encoder_channels, config.dim_proj, 1) for _ in range(num_features)
         )
         widths = [config.dim_proj, *config.dim_upsample]
         self.upsample_blocks = nn.ModuleList(
@@ -114,7 +115,7 @@ class Head(nn.Module):
         x = latent
         for block in self.upsample_blocks:
             x = block(_with_uv(x, aspect))
-        x = F.interpolate(x, network_size, mode="bilinear", align_corners=False)
+        x = resize(x, network_size)
         x = _with_uv(x, aspect)
         return self.output_block[0](x), self.output_block[1](x)
 
@@ -128,7 +129,7 @@ def _upsample_block(before: int, after: int, config: MoGeConfig) -> nn.Sequentia
     enlarge = nn.ConvTranspose2d(before + 2, after, 2, stride=2)
     with torch.no_grad():
         enlarge.weight.copy_(enlarge.weight[:, :, :1, :1].expand_as(enlarge.weight).clone())
-    smooth = nn.Conv2d(after, after, 3, padding=1, padding_mode="replicate")
+    smooth = Conv2d(after, after, 3, padding=1, padding_mode="replicate")
     hidden = config.dim_times_res_block_hidden * after
     return nn.Sequential(
         nn.Sequential(enlarge, smooth),
@@ -143,13 +144,13 @@ def _output_block(count: int, config: MoGeConfig) -> nn.Sequential:
     width, size = config.last_conv_channels, config.last_conv_size
     hidden = config.dim_times_res_block_hidden * width
     return nn.Sequential(
-        nn.Conv2d(config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"),
+        Conv2d(config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"),
         *(
             ResidualBlock(width, hidden, config.res_block_norm)
             for _ in range(config.last_res_blocks)
         ),
         nn.ReLU(),
-        nn.Conv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
+        Conv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
     )
 
 
@@ -220,8 +221,8 @@ class MoGeModel(GeometryModel):
     def decode(self, latent: Latent) -> AffinePoints:
         """Latent -> points and mask at the image's size."""
         points, mask = self.head(latent.features, latent.network_size)
-        points = F.interpolate(points, latent.image_size, mode="bilinear", align_corners=False)
-        mask = F.interpolate(mask, latent.image_size, mode="bilinear", align_corners=False)
+        points = resize(points, latent.image_size)
+        mask = resize(mask, latent.image_size)
         points = remap_points(points.movedim(1, -1).float(), self.architecture.remap_output)
         return AffinePoints(points, mask[:, 0].float())
 

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from dyfn_core.models.exact import Conv2d, Linear
 from dyfn_core.prediction import StreamState
 
 EPSILON = 1e-5
@@ -165,8 +166,8 @@ class ConvGRUCell(nn.Module):
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
-        self.conv_gates = nn.Conv2d(channels + hidden, 2 * hidden, 3, padding=1)
-        self.conv_candidate = nn.Conv2d(channels + hidden, hidden, 3, padding=1)
+        self.conv_gates = Conv2d(channels + hidden, 2 * hidden, 3, padding=1)
+        self.conv_candidate = Conv2d(channels + hidden, hidden, 3, padding=1)
 
     def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
         """x B x C x h x w, hidden B x D x h x w -> next hidden, same shape."""
@@ -182,8 +183,8 @@ class ConvGRUStabilizer(Stabilizer):
     def __init__(self, channels: int, config: StabilizerConfig) -> None:
         super().__init__(channels, config)
         self.conv_gru_cell = ConvGRUCell(channels, config.hidden)
-        self.gamma_head = nn.Conv2d(config.hidden, channels, 1)
-        self.beta_head = nn.Conv2d(config.hidden, channels, 1)
+        self.gamma_head = Conv2d(config.hidden, channels, 1)
+        self.beta_head = Conv2d(config.hidden, channels, 1)
         nn.init.zeros_(self.gamma_head.weight)
         nn.init.zeros_(self.beta_head.weight)
         nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
@@ -223,8 +224,8 @@ class GRUStabilizer(Stabilizer):
     def __init__(self, channels: int, config: StabilizerConfig) -> None:
         super().__init__(channels, config)
         self.gru_cell = nn.GRUCell(channels, config.hidden)
-        self.gamma_delta_head = nn.Linear(config.hidden, channels)
-        self.beta_delta_head = nn.Linear(config.hidden, channels)
+        self.gamma_delta_head = Linear(config.hidden, channels)
+        self.beta_delta_head = Linear(config.hidden, channels)
         for head in (self.gamma_delta_head, self.beta_delta_head):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)

@@ -21,7 +21,7 @@ from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.stream import DepthStream
 from dyfn_ros.messages import cloud_points, decode_depth
 from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, main, parse
+from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, load, main, parse
 from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
 from dyfn_ros.rosbags_messages import IMAGE, TYPES
 from dyfn_ros.threads import THREADS
@@ -513,13 +513,16 @@ def test_a_result_says_on_how_many_threads(recording: Path, tmp_path: Path) -> N
         assert metrics(tmp_path / "out")[name] == metrics(tmp_path / "other")[name]
 
 
-def test_the_bundled_model_gives_the_same_bytes_whatever_the_machine_has(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["tiny", "dyfn-mini"])
+def test_the_result_is_the_same_on_one_thread_and_on_several(tmp_path: Path, name: str) -> None:
     write_rgbd_recording(tmp_path / "walk", rgbd(2, truth=False))
+    loader = load_tiny if name == "tiny" else load
     hashes = set()
-    for threads in (1, 3):
-        torch.set_num_threads(threads)  # as OMP_NUM_THREADS or the number of cores would
-        options = ["--num-tokens", "24", "--no-output-recording"]
-        assert main([str(tmp_path / "walk"), "--out", str(tmp_path / "out"), *options]) == ALL
+    for threads in (1, 2, 3):
+        options = ["--model", name, "--num-tokens", "24", "--no-output-recording"]
+        options += ["--threads", str(threads), "--out", str(tmp_path / "out")]
+        assert main([str(tmp_path / "walk"), *options], loader) == ALL
+        assert metrics(tmp_path / "out")["options"]["threads"] == threads
         hashes.add(metrics(tmp_path / "out")["output_sha256"])
     assert len(hashes) == 1
 
