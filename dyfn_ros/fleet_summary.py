@@ -76,7 +76,8 @@ def mean_of(values: Sequence[float]) -> Mean:
             method="percentile",
             rng=np.random.default_rng(SEED),
         ).confidence_interval
-        low, high = float(found.low), float(found.high)
+        # a mean of equal values may be off by a rounding, and no mean lies outside its values
+        low, high = max(float(found.low), min(values)), min(float(found.high), max(values))
     return Mean(float(np.mean(values)), low, high, len(values))
 
 

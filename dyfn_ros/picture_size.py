@@ -10,10 +10,10 @@ JPEG = b"\xff\xd8\xff"
 PNG = b"\x89PNG\r\n\x1a\n"
 MAX_PIXELS = 1 << 26  # 8192 x 8192; a hundred bytes can claim to be a picture of gigabytes
 
-_PNG_SIZE = struct.Struct(">4sII")  # of the first chunk, after its length: IHDR, width, height
-_JPEG_SIZE = struct.Struct(
-    ">BHH"
-)  # of a start of frame, after its length: precision, height, width
+# Of a PNG's first chunk, after its length: IHDR, width, height.
+_PNG_SIZE = struct.Struct(">4sII")
+# Of a JPEG's start of frame, after its length: precision, height, width.
+_JPEG_SIZE = struct.Struct(">BHH")
 _NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # C0 to CF are starts of frames, but for these tables
 _ALONE = (0x01, *range(0xD0, 0xD9))  # markers without a length
 

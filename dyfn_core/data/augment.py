@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+PROCESSING = 1 << 20  # beside a look's seed: draws that leave the caller's generator alone
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
@@ -106,8 +107,8 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
     def spread(amount: float) -> float:
         return float(rng.uniform(-amount, amount)) * strength
 
-    def happens(probability: float) -> bool:
-        return bool(rng.random() < probability * strength)
+    def happens(probability: float, draws: np.random.Generator = rng) -> bool:
+        return bool(draws.random() < probability * strength)
 
     saturation = 0.0 if happens(0.07) else 1 + spread(0.7)
     balance = np.exp(rng.normal(0, 0.12 * strength, 3))
@@ -118,7 +119,7 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
     light = None
     if happens(0.4):
         light = np.exp(rng.normal(0, 0.35 * strength, (3, 4))).astype(np.float32)
-    return Look(
+    look = Look(
         colour=_colour_matrix(spread(0.35), saturation),
         gain=gain,
         offset=offset,
@@ -131,9 +132,13 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
         coarse=float(rng.uniform(1.3, 2.5)) if happens(0.2) else 1.0,
         jpeg=int(rng.integers(20, 95)) if happens(0.5) else None,
         seed=int(rng.integers(2**31)),
-        bloom=float(rng.uniform(0.1, 0.7)) if happens(0.25) else 0.0,
-        local=float(rng.uniform(0.1, 0.6)) if happens(0.3) else 0.0,
-        sharpen=float(rng.uniform(0.3, 2.0)) if happens(0.4) else 0.0,
+    )
+    own = np.random.default_rng([look.seed, PROCESSING])
+    return replace(
+        look,
+        bloom=float(own.uniform(0.1, 0.7)) if happens(0.25, own) else 0.0,
+        local=float(own.uniform(0.1, 0.6)) if happens(0.3, own) else 0.0,
+        sharpen=float(own.uniform(0.3, 2.0)) if happens(0.4, own) else 0.0,
     )
 
 

@@ -12,7 +12,6 @@ from dyfn_core.evaluation.benchmark_pictures import STRIPS, BenchmarkPictures, W
 from dyfn_core.evaluation.benchmark_table import sequence_table
 from dyfn_core.evaluation.report import (
     Cell,
-    Curves,
     Part,
     Picture,
     Section,
@@ -20,16 +19,13 @@ from dyfn_core.evaluation.report import (
     Text,
     write_report,
 )
-from dyfn_core.evaluation.sequence import over_median
-from dyfn_core.evaluation.sequence_report import latency_section
+from dyfn_core.evaluation.sequence_report import latency_section, over_time_curves
 
 NOTE = (
     "Image: each frame aligned to the truth by its own scale and shift; video: one scale and shift "
     "for the sequence; metric: none. Controls: a vertical ramp and a constant; of a model also its "
     "latent's statistics as a moving average (ema) and those of the first frame (frozen)."
 )
-
-
 PICTURE_NOTE = (
     "Pictures are of the first method in the table, aligned by its sequence's one scale and shift "
     f"(video), evenly spaced frames; of more than {STRIPS} sequences, {STRIPS} evenly spaced ones."
@@ -96,16 +92,8 @@ def _worst(worst: Sequence[WorstFrame]) -> list[Section]:
 
 
 def _curves(sequence: dict[str, Any]) -> list[Part]:
-    lines = {
-        name: {column: np.array(values, np.float64) for column, values in found.items()}
-        for name, found in sequence["over_time"].items()
-    }
-    scale = {name: over_median(found["scale"]) for name, found in lines.items()}
-    return [
-        Curves("Scale that fits each frame, over its median (flat is stable)", scale),
-        Curves("Shift that fits each frame, m", {n: found["shift"] for n, found in lines.items()}),
-        Curves(
-            "AbsRel, one alignment for the sequence (video)",
-            {n: found["video_abs_rel"] for n, found in lines.items()},
-        ),
-    ]
+    def lines(column: str) -> dict[str, np.ndarray]:
+        found = sequence["over_time"].items()
+        return {name: np.array(columns[column], np.float64) for name, columns in found}
+
+    return over_time_curves(lines("scale"), lines("shift"), lines("video_abs_rel"))

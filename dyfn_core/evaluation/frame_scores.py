@@ -10,7 +10,7 @@ from typing import overload
 
 import numpy as np
 
-from dyfn_core.evaluation.metrics import METRICS
+from dyfn_core.evaluation.metrics import METRICS, mean_metrics
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,8 @@ class MetricRows(Sequence["dict[str, float] | None"]):
 
     def means(self) -> dict[str, float] | None:
         """Means over the scored frames; None without one."""
-        table = np.array(self._values).reshape(-1, len(METRICS))
-        scored = table[~np.isnan(table[:, 0])]
-        if not len(scored):
-            return None
-        columns = np.ascontiguousarray(scored.T)
-        return {name: float(np.mean(c)) for name, c in zip(METRICS, columns, strict=True)}
+        scored = [metrics for metrics in self if metrics is not None]
+        return mean_metrics(scored) if scored else None
 
 
 class FrameScores(Sequence[FrameScore]):

@@ -85,16 +85,26 @@ def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
     def lines(column: str) -> dict[str, np.ndarray]:
         return {name: run.column(column) for name, run in runs.items()}
 
-    scale = {name: over_median(values) for name, values in lines("scale").items()}
+    scale = lines("scale")
     if np.isnan(np.concatenate(list(scale.values()))).all():
         return []
-    parts: list[Part] = [
-        Curves("Scale that fits each frame, over its median (flat is stable)", scale),
-        Curves("Shift that fits each frame", lines("shift")),
-        Curves("AbsRel, one alignment for the sequence (video)", lines("video_abs_rel")),
-        Curves("AbsRel, each frame by itself (image)", lines("image_abs_rel")),
-    ]
+    parts = over_time_curves(scale, lines("shift"), lines("video_abs_rel"))
+    parts.append(Curves("AbsRel, each frame by itself (image)", lines("image_abs_rel")))
     return [Section("Over time", parts)]
+
+
+def over_time_curves(
+    scale: Mapping[str, np.ndarray],
+    shift: Mapping[str, np.ndarray],
+    video_abs_rel: Mapping[str, np.ndarray],
+) -> list[Part]:
+    """What wanders over a sequence, of every frame by name; NaN: a gap."""
+    relative = {name: over_median(values) for name, values in scale.items()}
+    return [
+        Curves("Scale that fits each frame, over its median (flat is stable)", relative),
+        Curves("Shift that fits each frame", shift),
+        Curves("AbsRel, one alignment for the sequence (video)", video_abs_rel),
+    ]
 
 
 def _worst(name: str, run: SequenceEvaluation) -> list[Section]:

@@ -95,3 +95,16 @@ def small_moge() -> MoGeModel:
     torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)
     torch.nn.init.ones_(model.head.output_block[1][-1].bias)  # a mask that is mostly True
     return model.eval()
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Any:
+    """A Renderer of small_camera.SIZE; skips without OpenGL."""
+    from small_camera import SIZE
+
+    from dyfn_core.data.worlds.renderer import Renderer
+
+    try:
+        return Renderer(SIZE)
+    except Exception as error:
+        pytest.skip(f"no headless OpenGL on this machine: {error}")

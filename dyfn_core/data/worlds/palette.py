@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from dyfn_core.data.worlds.scene import TEXTURE_SIZE, fit_texture
 Draw = Callable[[np.random.Generator], np.ndarray]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 SMALLEST = 200
+KEPT = 200  # images in memory, 2 MB each
 PICTURE_FOLDERS = ("backgrounds", "wallpapers", "photos")
 MATERIAL_FOLDERS = ("textures", "materials")
 
@@ -34,7 +36,6 @@ class Palette:
     ) -> None:
         self.pool, self.photographs, self.materials = list(pool), list(photographs), list(materials)
         self.share = share
-        self._read: dict[Path, np.ndarray | None] = {}
 
     @classmethod
     def find(cls, assets: Path, pool: Sequence[np.ndarray] = ()) -> Palette:
@@ -79,12 +80,10 @@ class Palette:
         """One of the images, None when there is none or when it cannot be read or is tiny."""
         if not paths:
             return None
-        path = paths[rng.integers(len(paths))]
-        if path not in self._read:
-            self._read[path] = _read(path)
-        return self._read[path]
+        return _read(paths[rng.integers(len(paths))])
 
 
+@lru_cache(maxsize=KEPT)
 def _read(path: Path) -> np.ndarray | None:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None or min(image.shape[:2]) < SMALLEST:

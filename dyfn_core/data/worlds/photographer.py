@@ -159,17 +159,14 @@ class Photographer:
         sharp = self.renderer.draw(camera(t), look, now)
         blur = self._blur(camera, sharp, now, t)
         steps = int(np.clip(np.ceil(blur / PIXELS_A_SUBFRAME), 1, MAX_SUBFRAMES))
-        squares = np.zeros(sharp.image.shape, np.float32)
         if steps > 1:
             offsets = self.style.shutter * ((np.arange(steps) + 0.5) / steps - 0.5)
-            parts = [(camera(t + offset), moment(t + offset)) for offset in offsets]
+            parts = [self.renderer.draw(camera(t + o), look, moment(t + o)) for o in offsets]
         else:  # several samples within a pixel, since no camera has jagged edges
-            squares += np.square(sharp.image, dtype=np.float32)
-            parts = [(self._nudged(camera(t), by), now) for by in SUBPIXELS]
-        for at, then in parts:
-            part = self.renderer.draw(at, look, then)
-            squares += np.square(part.image, dtype=np.float32)
-        image = np.sqrt(squares / (len(parts) + (steps == 1))).astype(np.uint8)
+            nudged = [self._nudged(camera(t), by) for by in SUBPIXELS]
+            parts = [sharp, *(self.renderer.draw(at, look, now) for at in nudged)]
+        squares = np.sum([np.square(part.image, dtype=np.float32) for part in parts], axis=0)
+        image = np.sqrt(squares / len(parts)).astype(np.uint8)
         image = shade_corners(image, sharp.depth, camera(t).focal[0], self.style.corners)
         record: dict[str, object] = {
             "exposure": round(exposure, 5),

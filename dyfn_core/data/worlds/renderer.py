@@ -117,13 +117,19 @@ class Renderer:
         self.ctx.depth_func = "<="
         self.shadow_program: Any = self.ctx.program(SHADOW_SHADER, "#version 330\nvoid main() {}")
         shape = (size[1], size[0])
-        self.target: Any = self.ctx.framebuffer(
-            [self.ctx.texture(shape, 4), self.ctx.texture(shape, 1, dtype="f4")],
-            self.ctx.depth_renderbuffer(shape),
-        )
+        self.target = self._canvas(shape, "f1")
+        self._mirror_target = self._canvas((MIRROR_SIZE, MIRROR_SIZE), "f2")
         self._scene_objects: list[object] = []
         self._actors: list[_ActorMesh] = []
         self._placed: tuple[Placement, ...] = ()
+
+    def _canvas(self, shape: tuple[int, int], dtype: str) -> Any:
+        """A framebuffer of (width, height): colour of a dtype, and depth in metres."""
+        colour, depth = (
+            self.ctx.texture(shape, 4, dtype=dtype),
+            self.ctx.texture(shape, 1, dtype="f4"),
+        )
+        return self.ctx.framebuffer([colour, depth], self.ctx.depth_renderbuffer(shape))
 
     def vertex_arrays(self, vertices: Any, indices: Any) -> tuple[Any, Any, Any]:
         """The same triangles for the shading, the depth-only and the shadow program."""
@@ -256,7 +262,7 @@ class Renderer:
         cube = self.ctx.texture_cube((MIRROR_SIZE, MIRROR_SIZE), 3, dtype="f2")
         cube.use(4)
         self.program["surroundings"] = 4
-        self.program["mirrored"] = 0.0
+        self.program["mirrored"] = False
         corners = scene.vertices["position"]
         low, high = corners.min(axis=0), corners.max(axis=0)
         probe = (low + high) / 2
@@ -267,11 +273,7 @@ class Renderer:
         )
         if scene.lightmaps:
             return cube
-        shape = (MIRROR_SIZE, MIRROR_SIZE)
-        target: Any = self.ctx.framebuffer(
-            [self.ctx.texture(shape, 4, dtype="f2"), self.ctx.texture(shape, 1, dtype="f4")],
-            self.ctx.depth_renderbuffer(shape),
-        )
+        target = self._mirror_target
         self.program["raw"] = True
         self._set_moment(STILL)
         for face, axes in enumerate(CUBE_FACES):
@@ -284,11 +286,10 @@ class Renderer:
             # a degenerate triangle's NaN would spread over the coarse levels
             seen = np.frombuffer(target.read(components=3, dtype="f2"), np.float16)
             cube.write(face, np.clip(np.nan_to_num(seen), 0, BRIGHTEST).astype("f2").tobytes())
-        target.release()
         self.program["raw"] = False
         cube.build_mipmaps()
         cube.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self.program["mirrored"] = 1.0
+        self.program["mirrored"] = True
         return cube
 
     def _atlas(self, size: int) -> tuple[Any, Any]:

@@ -344,21 +344,17 @@ def _daylight(room: Room) -> list[Light]:
 
 def _sky(rng: np.random.Generator, window: Window) -> Light:
     """A soft cone from the window into the room, a little downwards."""
-    inward = np.cross(window.up, window.right)
-    inward = inward / np.linalg.norm(inward)
-    aim = inward + np.array([*rng.normal(0, 0.25, 2), -rng.uniform(0.1, 0.6)])
+    aim = window.inward + np.array([*rng.normal(0, 0.25, 2), -rng.uniform(0.1, 0.6)])
     color = np.array([0.92, 1.0, rng.uniform(1.0, 1.2)]) * rng.uniform(2, 12)
-    position = window.centre + 0.08 * inward
+    position = window.centre + 0.08 * window.inward
     return Light(position, aim / np.linalg.norm(aim), color, float(rng.uniform(120, 165)))
 
 
 def _sun(rng: np.random.Generator, window: Window) -> Light:
     """A patch of sunlight: a far lamp whose light comes through one window."""
-    inward = np.cross(window.up, window.right)
-    inward = inward / np.linalg.norm(inward)
     side = window.right / np.linalg.norm(window.right)
     across, height = np.radians(rng.uniform(-55, 55)), np.radians(rng.uniform(12, 55))
-    level = np.cos(across) * inward + np.sin(across) * side
+    level = np.cos(across) * window.inward + np.sin(across) * side
     way = np.cos(height) * level - np.array([0.0, 0.0, np.sin(height)])
     color = np.array([1.0, rng.uniform(0.85, 0.98), rng.uniform(0.65, 0.92)])
     color = color * rng.uniform(2.0, 9.0) * SUN_DISTANCE**2

@@ -38,6 +38,12 @@ class Window:
     up: np.ndarray
     bars: int = 1
 
+    @property
+    def inward(self) -> np.ndarray:
+        """Unit normal, into the room."""
+        normal = np.cross(self.up, self.right)
+        return normal / np.linalg.norm(normal)
+
     def corners(self) -> np.ndarray:
         """4 x 3."""
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])

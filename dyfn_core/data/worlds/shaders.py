@@ -37,7 +37,7 @@ uniform vec3 light_color[MAX_LIGHTS]; uniform float light_cosine[MAX_LIGHTS];
 uniform vec4 pane_centre[MAX_LIGHTS];  // w: bars across each pane; below 0 without a window
 uniform vec3 pane_right[MAX_LIGHTS]; uniform vec3 pane_up[MAX_LIGHTS];
 uniform samplerCube surroundings; uniform vec3 probe; uniform vec3 box_low; uniform vec3 box_high;
-uniform float mirrored; uniform bool raw;
+uniform bool mirrored; uniform bool raw;
 in vec3 position; in vec3 normal; in vec2 uv; in vec3 color; in vec2 lightmap_uv;
 in float depth; in float emission; flat in int layer; flat in int lightmap;
 layout(location = 0) out vec4 out_color; layout(location = 1) out float out_depth;
@@ -92,7 +92,7 @@ void main() {
         light = baked * (2.5 * light * light + 0.8 * light) + ambient * 0.4;
     } else {
         light = ambient * (0.75 + 0.25 * n.z) + key * max(dot(n, vec3(0.4, 0.3, 0.866)), 0.0);
-        if (mirrored > 0.0) light = 0.45 * light + 0.8 * textureLod(surroundings, n, 5.0).rgb;
+        if (mirrored) light = 0.45 * light + 0.8 * textureLod(surroundings, n, 5.0).rgb;
         float shiny = gloss * fract(float(layer) * 0.618);
         for (int i = 0; i < light_count; i++) {
             vec3 l = light_position[i] - position; float d2 = dot(l, l); l *= inversesqrt(d2);
@@ -108,25 +108,25 @@ void main() {
             shine += incoming * shiny * h;
         }
         float graze = 1.0 - abs(dot(n, to_eye)); graze *= graze; graze *= graze;
-        if (mirrored > 0.0) {
+        if (mirrored) {
             float blur = 4.0 * fract(float(layer) * 0.3247);
-            float strength = (0.04 + 0.96 * graze) * min(2.0 * shiny, 1.0) * mirrored;
+            float strength = (0.04 + 0.96 * graze) * min(2.0 * shiny, 1.0);
             shine += strength * reflected(reflect(-to_eye, n), blur);
         } else {
             shine += ambient * shiny * (0.05 + graze);
         }
     }
+    out_depth = depth;
+    vec3 radiance = albedo * (light + emission) + shine;
     if (raw) {
-        out_color = vec4(albedo * (light + emission) + shine, 1.0);
-        out_depth = depth;
+        out_color = vec4(radiance, 1.0);
         return;
     }
-    vec3 radiance = exposure * (albedo * (light + emission) + shine);
+    radiance *= exposure;
     radiance = radiance * (1.0 + radiance / 9.0) / (1.0 + radiance);
     vec3 tone = sqrt(radiance);
     vec3 steep = clamp(tone * 1.12, 0.0, 1.0); steep *= steep * (3.0 - 2.0 * steep);
     out_color = vec4(mix(tone, steep, contrast), alpha);
-    out_depth = depth;
 }
 """.replace("MAX_LIGHTS", str(MAX_LIGHTS))
     .replace("ACTOR_SHADOW_SIZE", f"{ACTOR_SHADOW_SIZE}.0")

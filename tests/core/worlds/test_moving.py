@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from small_camera import SIZE
 
 from dyfn_core.data.worlds import md3
 from dyfn_core.data.worlds.actors import Actor, Moment, Placement, stiff_actor
@@ -16,16 +17,6 @@ from dyfn_core.data.worlds.paths import CameraPath
 from dyfn_core.data.worlds.renderer import Camera, Renderer
 from dyfn_core.data.worlds.scene import SceneBuilder, new_vertices
 from dyfn_core.data.worlds.staging import LightScript, Way, stand
-
-SIZE = (48, 64)
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    try:
-        return Renderer(SIZE)
-    except Exception as error:
-        pytest.skip(f"no headless OpenGL on this machine: {error}")
 
 
 def box_actor(builder: SceneBuilder) -> Actor:

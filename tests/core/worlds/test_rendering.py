@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from small_camera import SIZE, rays
 
 from dyfn_core.data.worlds.cameras import CLEARANCE, FreeSpace, Lens, pose_at
 from dyfn_core.data.worlds.generate import Job, RoomWorlds, render
@@ -15,28 +16,10 @@ from dyfn_core.data.worlds.rooms import furnished_room
 from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder
 from dyfn_core.data.worlds.shards import DEPTH_INFINITE, View, encode_depth, write_shard
 
-SIZE = (48, 64)
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    try:
-        return Renderer(SIZE)
-    except Exception as error:
-        pytest.skip(f"no headless OpenGL on this machine: {error}")
-
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
     return furnished_room(np.random.default_rng(3), None)
-
-
-def rays(camera: Camera) -> np.ndarray:
-    """H x W x 3 camera rays with z = 1 through the pixel centres."""
-    v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
-    x = (u / SIZE[1] - camera.centre[0]) / camera.focal[0]
-    y = (v / SIZE[0] - camera.centre[1]) / camera.focal[1]
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def test_depth_is_the_ray_cast_z_at_every_pixel_centre(renderer: Renderer, room: Scene) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_rendering import rays
+from small_camera import rays
 
 from dyfn_core.data.worlds import textures
 from dyfn_core.data.worlds.actors import STILL
@@ -16,16 +16,7 @@ from dyfn_core.data.worlds.photographer import Photographer
 from dyfn_core.data.worlds.renderer import Camera, Look, Picture, Renderer
 from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder, Window
 
-SIZE = (48, 64)
 DOWN = Camera(pose_at(np.array([2.0, 2.0, 2.5]), 0.0, -np.pi / 2, 0.0), (0.5, 0.5 * 4 / 3))
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    try:
-        return Renderer(SIZE)
-    except Exception as error:
-        pytest.skip(f"no headless OpenGL on this machine: {error}")
 
 
 def empty_room(**fields: object) -> SceneBuilder:
