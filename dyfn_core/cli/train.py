@@ -13,7 +13,8 @@ from dyfn_core.cli import experiments
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
 from dyfn_core.evaluation.controls import VariantScore, score_variants, variant_table
-from dyfn_core.models.checkpoints import load_model
+from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.training.average import average
 from dyfn_core.training.base import BaseTask
 from dyfn_core.training.config import (
     BaseRunConfig,
@@ -44,6 +45,10 @@ def main(arguments: list[str] | None = None) -> int:
             return 0
         if options.command == "curve":
             _curve(options)
+            return 0
+        if options.command == "average":
+            shares = options.shares or [1.0] * len(options.models)
+            save_model(average(options.models, shares), options.out)
             return 0
         _trainer(options).train(options.max_steps)
     except InterruptedRunError as stop:
@@ -154,6 +159,14 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--metric", action="append", default=[], help="default: all logged")
     command.add_argument("--config", type=Path, help="of the run, if its folder has none")
     command.add_argument("--out", type=Path, help="folder for both files (default: the run's)")
+    command = commands.add_parser(
+        "average", help="mean of the weights of runs with a common start; DyFN is the first's"
+    )
+    command.add_argument("models", type=Path, nargs="+", help="checkpoint files")
+    command.add_argument(
+        "--shares", type=float, nargs="+", help="of each, divided by their sum (default: equal)"
+    )
+    command.add_argument("--out", type=Path, required=True, help="file to write")
     command = commands.add_parser(
         "evaluate", help="a model and its controls under the image and video protocols"
     )
