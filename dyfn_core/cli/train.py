@@ -134,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True)
     purposes = {
         "base": "train encoder and head on rendered frames",
-        "stabilizer": "train DyFN on rendered clips, everything else frozen",
+        "stabilizer": "train DyFN on clips or recordings, everything else frozen",
         "scale": "teach DyFN's recurrence the base's errors of scale, without decoding",
     }
     for name, purpose in purposes.items():

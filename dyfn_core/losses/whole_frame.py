@@ -17,12 +17,12 @@ MOST_WEIGHT = 10.0  # times the mean one: tiny true depths must not decide every
 
 
 def coarse_samples(target: Target, grid: tuple[int, int]) -> Tensor:
-    """Indices into the flattened frame, B x N: in each cell of a grid, a valid pixel if any."""
+    """Indices into the flattened frame, B x N: the middle of each cell of a grid."""
     batch, height, width = target.valid.shape
     rows = ((torch.arange(grid[0]) + 0.5) * height / grid[0]).long()
     cols = ((torch.arange(grid[1]) + 0.5) * width / grid[1]).long()
     index = (rows[:, None] * width + cols[None, :]).flatten()
-    return index.expand(batch, -1)
+    return index.to(target.valid.device).expand(batch, -1)
 
 
 def align_frames(points: Tensor, target: Target) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ from dyfn_core.training.processes import full_precision, part_seed, share_of
 from dyfn_core.training.trainer import Task
 from dyfn_core.training.validation import Sequence, recording_examples, sequence_scores
 
+logger = logging.getLogger(__name__)
 VALIDATION_SEED = 1_000_000_007
 
 
@@ -191,6 +193,7 @@ class StabilizerTask(Task):
             found = find_sequences(source, "held_out")
         except FileNotFoundError:
             found = find_sequences(source, "train")
+            logger.warning("nothing is held out: validation is on clips that are trained on")
         sequences: list[Sequence] = []
         draw = 0
         while len(sequences) < self.config.validation_clips:

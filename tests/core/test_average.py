@@ -71,4 +71,8 @@ def test_another_architecture_is_refused_naming_file_and_tensor(
     a, b = saved(tmp_path, "a", 1), saved(tmp_path, "b", 2, wider)
     assert main(["average", str(a), str(b), "--out", str(tmp_path / "mean.safetensors")]) == 1
     told = capsys.readouterr().err
-    assert str(b) in told and "not of one architecture" in told and "(16, 26, 1, 1) in the second" in told
+    assert (
+        str(b) in told
+        and "not of one architecture" in told
+        and "(16, 26, 1, 1) in the second" in told
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -229,3 +230,20 @@ def test_last_doubling_is_read_between_validations() -> None:
     assert half == pytest.approx(0.4 - 0.2 * 0.75)  # 28.3 is 1.5 of 2 octaves
     assert end == 0.1
     assert last_doubling(rows[:1], "e") is None
+
+
+def test_an_override_that_is_no_yaml_is_named(place: Path) -> None:
+    with pytest.raises(ConfigError, match=r"--set 'steps=\[1': the value is no YAML"):
+        settings(place, "steps=[1")
+
+
+def test_validation_on_what_is_trained_on_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tiny_base(tmp_path)
+    values = tiny_stabilizer_settings(tmp_path)
+    shutil.rmtree(tmp_path / "data" / "clips" / "b_1")
+    config = StabilizerRunConfig.model_validate({**values, "steps": 1})
+    with torch.no_grad():
+        StabilizerTask(config, tmp_path / "latents").validate()
+    assert "nothing is held out" in caplog.text
