@@ -80,7 +80,9 @@ def test_a_signal_ends_the_demo_and_its_node(tmp_path: Path, number: int) -> Non
         "time.sleep(600)\n"
     )
     code = (
-        "import sys\nfrom dyfn_ros.demo import main\n"
+        "import signal, sys\nfrom dyfn_ros.demo import main\n"
+        # a shell's background job inherits an ignored SIGINT
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.exit(main(sys.argv[1:], [sys.executable, {str(script)!r}]))"
     )
     where = ["--recording", str(tmp_path / "walk"), "--out", str(tmp_path / "out")]
