@@ -24,10 +24,10 @@ class ScaleTask(StabilizerTask):
     """DyFN in residual form, trained on summaries with the decoder linearised.
 
     A frame whose statistics are corrected by gamma and beta has, to first order, the scale error
-    e + slope . (gamma, beta), and its depth is the base's times the exponential of that product.
-    The loss is the spread of these errors within a clip, the video protocol's error of sampled
-    depths, and a share of the errors' size and of the corrections'. Judged, like every DyFN, with
-    the real decoder.
+    e + slope . (gamma, beta), with a slope of its own, and its depth is the base's times the
+    exponential of that product. The loss is the spread of these errors within a clip, the video
+    protocol's error of sampled depths, and a share of the errors' size and of the corrections'.
+    Judged, like every DyFN, with the real decoder.
     """
 
     config: ScaleRunConfig
@@ -46,7 +46,6 @@ class ScaleTask(StabilizerTask):
         self.summaries = SummaryCache(
             config.cache or cache_folder, self.model, self.source, config.summary_draws
         )
-        self.slope = self.summaries.slope.to(device)
         if stabilizer.config.standardize and not config.warm_start:
             mean, std = self.summaries.usual()
             stabilizer.get_buffer("usual_mean").copy_(mean)
@@ -63,8 +62,9 @@ class ScaleTask(StabilizerTask):
         return batch.error.numel()
 
     def loss(self, batch: SummaryClips) -> tuple[Tensor, dict[str, float]]:  # type: ignore[override]
+        batch = batch.to(self.model.device)
         change = self._corrections(batch.summary.float())
-        moved = change @ self.slope
+        moved = (change * batch.slope.float()).sum(-1)
         seen = torch.isfinite(batch.error)
         error = torch.where(seen, batch.error + moved, 0.0)
         before = torch.where(seen, batch.error, 0.0)

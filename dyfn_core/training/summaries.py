@@ -8,7 +8,7 @@ clip shrinks from megabytes to kilobytes a frame, and a step of training needs n
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from dyfn_core.training.config import ConfigError
 from dyfn_core.training.latents import CacheFolder, encode_clips, fingerprint
 
 FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
+TOGETHER = 8  # frames whose decoder is differentiated at once
 GRID = (6, 8)  # samples of a frame's depth, evenly spread
 
 
@@ -28,33 +29,40 @@ GRID = (6, 8)  # samples of a frame's depth, evenly spread
 class SummaryClips:
     """B clips of T frames. summary: B x T x C (x h x w) float16, as Stabilizer.summarise gives it.
     error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any. depth,
-    truth: B x T x N, the base's z and the true one (NaN where unknown) at the same N pixels."""
+    truth: B x T x N, the base's z and the true one (NaN where unknown) at the same N pixels. slope:
+    B x T x 2C float16, derivative of a frame's error by DyFN's residual gamma and beta: its
+    direction is nearly the same everywhere, its length is not."""
 
     summary: Tensor
     error: Tensor
     depth: Tensor
     truth: Tensor
+    slope: Tensor
+
+    def to(self, device: torch.device | str) -> SummaryClips:
+        """The same on another device."""
+        return SummaryClips(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 class SummaryCache:
     """`draws` clips in a folder (CacheFolder), made once and kept in memory.
 
-    slope: 2C, the mean derivative of a frame's error by DyFN's residual gamma and beta. Raises
-    ConfigError when the folder was made with another model or source.
+    Raises ConfigError when the folder was made with another model, source or recurrence.
     """
 
     def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
         assert model.stabilizer is not None
         wanted = fingerprint(model, source)
         wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
+        wanted["contents"] = [field.name for field in fields(SummaryClips)]
         files = CacheFolder(folder, draws, wanted, "summaries")
         files.build(source, partial(summarise_clips, model))
         parts = files.load()
         self.summary = torch.cat([part["summary"] for part in parts])
-        self.error, self.depth, self.truth = (
-            torch.cat([part[name] for part in parts]) for name in ("error", "depth", "truth")
+        self.error, self.depth, self.truth, self.slope = (
+            torch.cat([part[name] for part in parts])
+            for name in ("error", "depth", "truth", "slope")
         )
-        self.slope = torch.stack([part["slope"] for part in parts]).mean(0)
 
     def usual(self) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation of every channel over all clips."""
@@ -64,7 +72,8 @@ class SummaryCache:
     def batches(
         self, start: int, seed: int, clips: int, length: int, strides: tuple[int, int]
     ) -> Iterator[SummaryClips]:
-        """Endless batches: `length` frames, strides[0]..strides[1] apart, also backwards."""
+        """Endless batches, on the CPU: `length` frames, strides[0]..strides[1] apart, also
+        backwards."""
         step = start
         frames = self.summary.shape[1]
         longest = min(strides[1], (frames - 1) // (length - 1))
@@ -85,12 +94,12 @@ class SummaryCache:
         index = below(frames - (length - 1) * stride) + stride * torch.arange(length)
         if below(2):
             index = index.flip(0)
-        parts = (self.summary, self.error, self.depth, self.truth)
+        parts = (self.summary, self.error, self.depth, self.truth, self.slope)
         return tuple(part[clip, index] for part in parts)
 
 
 def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
-    """summary, error, depth and truth as in SummaryClips, slope 2C of the clips' first frames."""
+    """The parts of SummaryClips."""
     stabilizer = model.stabilizer
     assert stabilizer is not None
     clips = encode_clips(model, batch)
@@ -111,13 +120,17 @@ def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]
         errors.append(torch.where(seen, level - truth + focal.log(), torch.nan))
         depths.append(samples(z))
         truths.append(samples(torch.where(valid, depth, torch.nan)))
-        slopes.append(scale_slope(model, Latent(latent[:1], half, clips.network_size), depth[:1]))
+        slope = [
+            scale_slope(model, Latent(some, half, clips.network_size), known)
+            for some, known in zip(latent.split(TOGETHER), depth.split(TOGETHER), strict=True)
+        ]
+        slopes.append(torch.cat(slope).half())
     return {
         "summary": torch.stack(summaries).contiguous(),
         "error": torch.stack(errors),
         "depth": torch.stack(depths),
         "truth": torch.stack(truths),
-        "slope": torch.stack(slopes).mean(0),
+        "slope": torch.stack(slopes),
     }
 
 
@@ -146,14 +159,13 @@ def samples(image: Tensor) -> Tensor:
 
 
 def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
-    """2C: derivative of mean_log by the residual gamma and beta, at zero, mean over frames."""
+    """B x 2C: derivative of each frame's mean_log by its residual gamma and beta, at zero."""
     features = latent.features
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
-    change = features.new_zeros(2, features.shape[1], requires_grad=True)
-    gamma, beta = change[0].view(1, -1, 1, 1), change[1].view(1, -1, 1, 1)
+    change = features.new_zeros(len(features), 2 * features.shape[1], 1, 1, requires_grad=True)
+    gamma, beta = change.chunk(2, dim=1)
     with torch.enable_grad():
         moved = gamma.exp() * (features - mean) + mean + std * beta
         z = decoded_z(model, Latent(moved, latent.image_size, latent.network_size))
-        level = mean_log(z, depth)
-        (slope,) = torch.autograd.grad(level.mean(), change)
-    return slope.flatten()
+        (slope,) = torch.autograd.grad(mean_log(z, depth).sum(), change)
+    return slope.flatten(1)

@@ -75,17 +75,19 @@ def test_samples_pair_the_bases_depth_with_the_true_one(place: Path, tmp_path: P
 def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path: Path) -> None:
     made = task(place, tmp_path)
     torch.manual_seed(3)
-    features = torch.randn(1, 8, 4, 8)
-    latent, depth = Latent(features, (16, 32), (32, 64)), torch.ones(1, 16, 32)
+    features = torch.randn(2, 8, 4, 8) * torch.tensor([1.0, 3.0]).view(2, 1, 1, 1)
+    latent, depth = Latent(features, (16, 32), (32, 64)), torch.ones(2, 16, 32)
     slope = scale_slope(made.model, latent, depth)
-    change = 0.01 * torch.randn(16)
+    change = 0.01 * torch.randn(2, 16)
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
-    gamma, beta = (part.view(1, 8, 1, 1) for part in change.chunk(2))
+    gamma, beta = (part.view(2, 8, 1, 1) for part in change.chunk(2, 1))
     moved = replace(latent, features=gamma.exp() * (features - mean) + mean + std * beta)
     with torch.no_grad():
         after, before = (decoded_z(made.model, one) for one in (moved, latent))
         found = mean_log(after, depth) - mean_log(before, depth)
-    torch.testing.assert_close(found[0], slope @ change, rtol=0.05, atol=1e-5)
+    wanted = (slope * change).sum(1)
+    torch.testing.assert_close(found, wanted, rtol=0.05, atol=1e-5)
+    assert abs(float(wanted[0] - (slope[1] * change[0]).sum())) > 1e-4  # each frame has its own
 
 
 def test_training_lowers_the_spread_of_the_scales(place: Path, tmp_path: Path) -> None:
