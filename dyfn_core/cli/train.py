@@ -8,6 +8,9 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from dyfn_core.cli import experiments
 from dyfn_core.data.rendered import list_shards
@@ -28,7 +31,15 @@ from dyfn_core.training.processes import Processes
 from dyfn_core.training.scale import ScaleTask
 from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
 from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.trainer import InterruptedRunError, Task, Trainer, TrainingError
+from dyfn_core.training.task import Task
+from dyfn_core.training.trainer import (
+    BEST_FILE,
+    MODEL_FILE,
+    InterruptedRunError,
+    Trainer,
+    TrainingError,
+    check_folder,
+)
 
 FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
 
@@ -50,7 +61,9 @@ def main(arguments: list[str] | None = None) -> int:
             shares = options.shares or [1.0] * len(options.models)
             save_model(average(options.models, shares), options.out)
             return 0
-        _trainer(options).train(options.max_steps)
+        trainer = _trainer(options)
+        trainer.train(options.max_steps)
+        _tell_result(trainer)
     except InterruptedRunError as stop:
         print(f"dyfn-train: {stop}", file=sys.stderr)
         return 128 + stop.number
@@ -82,22 +95,45 @@ def _trainer(options: argparse.Namespace) -> Trainer:
         path = options.config or FINE_TUNING
         config = stabilizer = read_config(path, StabilizerRunConfig, overrides)
         make = partial(StabilizerTask, stabilizer, options.out / "latents")
+    check_folder(options.out, options.resume)  # before anything long is begun
     processes = Processes(config)
     with processes.main_first():
         task = make(device=processes.device)
     return Trainer(task, config, options.out, options.resume, processes)
 
 
+def _tell_result(trainer: Trainer) -> None:
+    if trainer.folder is None:
+        return
+    print(f"step {trainer.step}: {trainer.out / MODEL_FILE}")
+    if (trainer.out / BEST_FILE).exists():
+        print(f"best validation score, {trainer.best:.4f}: {trainer.out / BEST_FILE}")
+    print("either is a --model for dyfn-replay, dyfn-eval and the node")
+
+
 def _data_override(given: list[str]) -> list[str]:
-    """--data PATH and KIND=PATH as a setting."""
+    """--data PATH, KIND=PATH and mappings as a setting. Raises ConfigError."""
     if not given:
         return []
-    sets = []
+    sets: list[dict[str, Any]] = []
     for text in given:
+        if text.startswith("{"):
+            sets.append(_described_data(text))
+            continue
         kind, found, root = text.partition("=")
         named = found and not Path(text).exists()
         sets.append({"kind": kind, "root": root} if named else {"root": text})
     return [f"data={json.dumps(sets)}"]
+
+
+def _described_data(text: str) -> dict[str, Any]:
+    try:
+        described = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--data {text!r} is no YAML: {error}") from error
+    if not isinstance(described, dict):
+        raise ConfigError(f"--data {text!r}: expected a mapping such as {{root: PATH, kind: KIND}}")
+    return described
 
 
 def _curve(options: argparse.Namespace) -> None:
@@ -145,7 +181,8 @@ def _parser() -> argparse.ArgumentParser:
             action="append",
             default=[],
             metavar="[KIND=]PATH",
-            help="recording, RGB-D folder, rendered folder or data set; instead of the config's",
+            help="recording, RGB-D folder, rendered folder or data set; instead of the config's. "
+            "With options: '{root: PATH, kind: KIND, OPTION: VALUE}'",
         )
         command.add_argument("--out", type=Path, required=True, help="folder of the run")
         command.add_argument("--resume", action="store_true", help="go on from OUT/state.pt")

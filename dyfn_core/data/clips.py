@@ -98,34 +98,43 @@ class ClipBatch:
     intrinsics: Tensor
 
 
-class ClipBatches(IterableDataset[tuple[ClipBatch, list[str]]]):
+class ClipBatches(IterableDataset[tuple[ClipBatch | Exception, list[str]]]):
     """An endless stream of batches, each with what was drawn but could not be read.
 
-    The n-th depends on the seed, n and the data alone.
+    The n-th depends on the seed, n and the data alone. What ends the stream comes in a batch's
+    place: raised in another process, its message would be a traceback.
     """
 
     def __init__(self, source: ClipSource, start: int = 0, split: str = "train") -> None:
         super().__init__()
         self.source, self.start, self.split = source, start, split
 
-    def __iter__(self) -> Iterator[tuple[ClipBatch, list[str]]]:
+    def __iter__(self) -> Iterator[tuple[ClipBatch | Exception, list[str]]]:
         index, listed, pool = self.start, -np.inf, None
         while True:
-            if pool is None or time.monotonic() - listed > self.source.relist_seconds:
-                pool = find_sequences(self.source, self.split)
-                listed = time.monotonic()
             unreadable: list[str] = []
-            yield draw_batch(self.source, pool, index, unreadable), unreadable
+            try:
+                if pool is None or time.monotonic() - listed > self.source.relist_seconds:
+                    pool = find_sequences(self.source, self.split)
+                    listed = time.monotonic()
+                batch = draw_batch(self.source, pool, index, unreadable)
+            except (DataError, FileNotFoundError) as error:
+                yield error, unreadable
+                return
+            yield batch, unreadable
             index += 1
 
 
 class BatchLoader:
     """Batches made by one background process; what could not be read is logged and counted.
 
-    unreadable: message -> how often it was drawn.
+    unreadable: message -> how often it was drawn; a given Counter is added to.
+    Raises DataError when too many clips in a row cannot be read.
     """
 
-    def __init__(self, source: ClipSource, start: int = 0) -> None:
+    def __init__(
+        self, source: ClipSource, start: int = 0, unreadable: Counter[str] | None = None
+    ) -> None:
         find_sequences(source, "train")  # opened here, so that the process inherits it
         loader = DataLoader(
             ClipBatches(source, start),
@@ -135,18 +144,20 @@ class BatchLoader:
             worker_init_fn=_leave_signals_to_the_run,
         )
         self._batches = iter(loader)
-        self.unreadable: Counter[str] = Counter()
+        self.unreadable: Counter[str] = Counter() if unreadable is None else unreadable
 
     def __iter__(self) -> BatchLoader:
         return self
 
     def __next__(self) -> ClipBatch:
-        batch: ClipBatch
+        batch: ClipBatch | Exception
         batch, unreadable = next(self._batches)
         for message in unreadable:
             if message not in self.unreadable:
                 logger.warning("another clip was drawn instead: %s", message)
             self.unreadable[message] += 1
+        if isinstance(batch, Exception):
+            raise batch
         return batch
 
 
@@ -161,9 +172,11 @@ def find_sequences(source: ClipSource, split: str) -> DataPool:
     return open_pool(source.data, split, span, source.kinds)
 
 
-def batch_loader(source: ClipSource, start: int = 0) -> BatchLoader:
-    """Batches from step `start` on."""
-    return BatchLoader(source, start)
+def batch_loader(
+    source: ClipSource, start: int = 0, unreadable: Counter[str] | None = None
+) -> BatchLoader:
+    """Batches from step `start` on; see BatchLoader."""
+    return BatchLoader(source, start, unreadable)
 
 
 def draw_batch(

@@ -117,14 +117,16 @@ def uninterrupted(
 
 
 def camera_intrinsics(
-    fx: float, fy: float, cx: float, cy: float, size: tuple[int, int]
+    fx: float, fy: float, cx: float, cy: float, size: tuple[int, int], owner: object = None
 ) -> np.ndarray:
     """Pixels of an image of size (H, W), the first pixel's centre at 0 -> normalised, float32.
 
-    Raises FrameError unless they are finite and the focal lengths positive.
+    Raises FrameError, naming the owner if given, unless they are finite and the focal lengths
+    positive.
     """
     height, width = size
     values = np.array([fx / width, fy / height, (cx + 0.5) / width, (cy + 0.5) / height])
     if not np.isfinite(values).all() or fx <= 0 or fy <= 0:
-        raise FrameError(f"unusable intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g}")
+        named = "" if owner is None else f"{owner}: "
+        raise FrameError(f"{named}unusable intrinsics fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g}")
     return values.astype(np.float32)

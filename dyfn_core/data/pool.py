@@ -80,7 +80,15 @@ def open_pool(
             f"no sequence of split {split!r} with {span} frames or more under {roots}: "
             + "; ".join(report.summary() for report in reports)
         )
+    for report in reports:
+        _tell(report.summary(), bool(report.problems))
     return DataPool(sequences, np.array(shares) / total, reports)
+
+
+@lru_cache(maxsize=256)
+def _tell(summary: str, problems: bool) -> None:
+    """To the log, once a process: pools are opened again and again."""
+    logger.log(logging.WARNING if problems else logging.INFO, "%s", summary)
 
 
 def _open(
@@ -116,8 +124,6 @@ def _open_once(spec: DataSpec) -> tuple[list[FrameSequence], DataReport]:
     sequences, report = open_kind(spec.kind, spec.root, dict(spec.options))
     if spec.cuts:
         sequences = cut_sequences(sequences, spec.cuts)
-    level = logging.WARNING if report.problems else logging.INFO
-    logger.log(level, "%s", report.summary())
     return sequences, report
 
 

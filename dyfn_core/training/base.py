@@ -25,7 +25,7 @@ from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
 from dyfn_core.training.pictures import picture_rows
 from dyfn_core.training.processes import full_precision, part_seed, share_of
-from dyfn_core.training.trainer import Task
+from dyfn_core.training.task import Task
 from dyfn_core.training.validation import Example, recording_examples, score, spread_examples
 
 LOCAL_LEVELS = (1 / 4, 1 / 16)
@@ -77,7 +77,7 @@ class BaseTask(Task):
         ]
 
     def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[ClipBatch]:
-        return batch_loader(part_source(self.source, part, parts), start)
+        return batch_loader(part_source(self.source, part, parts), start, self.unreadable)
 
     def images(self, batch: ClipBatch) -> int:
         return len(batch.image)

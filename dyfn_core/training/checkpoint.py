@@ -1,4 +1,4 @@
-"""state.pt: what a run needs to go on, whole or not at all, with the one before it kept."""
+"""What a run writes whole or not at all: texts, and state.pt with the one before it kept."""
 
 from __future__ import annotations
 
@@ -40,6 +40,13 @@ def write_state(folder: Path, state: dict[str, Any]) -> None:
     if current.exists():
         current.replace(folder / PREVIOUS_FILE)
     partial.replace(current)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a small file; a reader, or a run that follows a kill, sees the old or the new one."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text)
+    partial.replace(path)
 
 
 def read_state(folder: Path) -> dict[str, Any]:

@@ -286,8 +286,10 @@ def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Setti
         values = yaml.safe_load(path.read_text())
     except FileNotFoundError as error:
         raise ConfigError(f"no training config at {path}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path} is no YAML: {error}") from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(
+            f"{path} is no readable YAML file of settings (data are given with --data): {error}"
+        ) from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping of settings")
     for override in overrides:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
 from dyfn_core.models.base import GeometryModel
+from dyfn_core.training.checkpoint import write_text
 from dyfn_core.training.config import ConfigError
 
 META = "cache.json"
@@ -56,17 +58,20 @@ class CacheFolder:
     """`draws` numbered files of tensors in a folder, each made from one batch of clips.
 
     The folder says what it was made with (wanted); a folder made with something else is an error,
-    not a surprise. An interrupted build goes on where it stopped. holds: what the files are, for
-    messages.
+    not a surprise. An interrupted build goes on where it stopped; one that made no file, such as
+    one of data that could not be opened, binds nobody. holds: what the files are, for messages.
     """
 
     def __init__(self, folder: Path, draws: int, wanted: dict[str, Any], holds: str) -> None:
         self.folder, self.draws, self.holds = folder, draws, holds
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / META
-        if not path.exists():
-            path.write_text(json.dumps(wanted, indent=1))
-        found = json.loads(path.read_text())
+        if next(folder.glob("*.safetensors"), None) is None:
+            write_text(path, json.dumps(wanted, indent=1))
+        try:
+            found = dict(json.loads(path.read_text()))
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path} does not tell how {holds} were made: {error}") from error
         other = sorted(key for key in wanted if found.get(key) != wanted[key])
         if other:
             raise ConfigError(
@@ -74,12 +79,17 @@ class CacheFolder:
                 "delete it or give another `cache`"
             )
 
-    def build(self, source: ClipSource, make: Callable[[ClipBatch], dict[str, Tensor]]) -> None:
-        """Make the files that are missing, each whole or not at all."""
+    def build(
+        self,
+        source: ClipSource,
+        make: Callable[[ClipBatch], dict[str, Tensor]],
+        unreadable: Counter[str],
+    ) -> None:
+        """Make the files that are missing, each whole or not at all; counts as BatchLoader does."""
         missing = [index for index in range(self.draws) if not self._path(index).exists()]
         if not missing:
             return
-        batches = batch_loader(source, missing[0])
+        batches = batch_loader(source, missing[0], unreadable)
         for index in track(range(missing[0], self.draws), description=f"making {self.holds}"):
             parts = make(next(batches))
             partial = self._path(index).with_suffix(".partial")
@@ -95,9 +105,19 @@ class CacheFolder:
 
 
 class LatentCache:
-    """`draws` batches of encoded clips in a folder (CacheFolder), made once and kept in memory."""
+    """`draws` batches of encoded clips in a folder (CacheFolder), made once and kept in memory.
 
-    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
+    unreadable: counts what could not be read while they were made.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        model: GeometryModel,
+        source: ClipSource,
+        draws: int,
+        unreadable: Counter[str],
+    ) -> None:
         def make(batch: ClipBatch) -> dict[str, Tensor]:
             clips = encode_clips(model, batch)
             return {
@@ -109,7 +129,7 @@ class LatentCache:
             }
 
         files = CacheFolder(folder, draws, fingerprint(model, source), "latents")
-        files.build(source, make)
+        files.build(source, make, unreadable)
         self.entries = [_latent_clips(parts) for parts in files.load()]
 
     def batches(self, start: int, seed: int, clips: int, length: int) -> Iterator[LatentClips]:

@@ -17,6 +17,7 @@ import torch
 import yaml
 from torch.utils.tensorboard import SummaryWriter
 
+from dyfn_core.training.checkpoint import write_text
 from dyfn_core.training.config import RunConfig
 
 CONFIG_FILE = "config.yaml"
@@ -47,8 +48,8 @@ class RunFolder:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / RESULTS_FILE).unlink(missing_ok=True)
         settings = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-        _write(folder / CONFIG_FILE, settings)
-        _write(folder / VERSIONS_FILE, json.dumps({**versions(), **facts}, indent=1) + "\n")
+        write_text(folder / CONFIG_FILE, settings)
+        write_text(folder / VERSIONS_FILE, json.dumps({**versions(), **facts}, indent=1) + "\n")
         self._drop_lines_after(step)
         self.writer = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
@@ -56,7 +57,7 @@ class RunFolder:
         path = self.folder / LOG_FILE
         if path.exists():
             kept = [line for line in read_log(path) if line["step"] <= step]
-            _write(path, "".join(json.dumps(line) + "\n" for line in kept))
+            write_text(path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def log(self, group: str, step: int, values: dict[str, float], **more: float) -> None:
         """One line of log.jsonl and one point of each curve "group/name"."""
@@ -79,7 +80,7 @@ class RunFolder:
             name: None if isinstance(value, float) and not math.isfinite(value) else value
             for name, value in values.items()
         }
-        _write(self.folder / RESULTS_FILE, json.dumps(finite, indent=1) + "\n")
+        write_text(self.folder / RESULTS_FILE, json.dumps(finite, indent=1) + "\n")
 
     def close(self) -> None:
         """Flush the curves."""
@@ -161,9 +162,3 @@ def _memory_gb() -> float | None:
     except (ValueError, OSError, AttributeError):
         return None
     return round(size / 2**30, 1)
-
-
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text)
-    partial.replace(path)

@@ -44,7 +44,11 @@ class ScaleTask(StabilizerTask):
                 f"{stabilizer.config.form!r}"
             )
         self.summaries = SummaryCache(
-            config.cache or cache_folder, self.model, self.source, config.summary_draws
+            config.cache or cache_folder,
+            self.model,
+            self.source,
+            config.summary_draws,
+            self.unreadable,
         )
         if stabilizer.config.standardize and not config.warm_start:
             mean, std = self.summaries.usual()

@@ -34,8 +34,13 @@ from dyfn_core.training.config import ConfigError, StabilizerRunConfig
 from dyfn_core.training.latents import LatentCache, LatentClips, encode_clips
 from dyfn_core.training.pictures import coloured_depth
 from dyfn_core.training.processes import full_precision, part_seed, share_of
-from dyfn_core.training.trainer import Task
-from dyfn_core.training.validation import Sequence, recording_examples, sequence_scores
+from dyfn_core.training.task import Task
+from dyfn_core.training.validation import (
+    Sequence,
+    known_mean,
+    recording_examples,
+    sequence_scores,
+)
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 1_000_000_007
@@ -57,7 +62,9 @@ class StabilizerTask(Task):
         self.cache: LatentCache | None = None
         if config.cache_draws:
             folder = config.cache or cache_folder
-            self.cache = LatentCache(folder, self.model, self.source, config.cache_draws)
+            self.cache = LatentCache(
+                folder, self.model, self.source, config.cache_draws, self.unreadable
+            )
         self.sequences: dict[str, list[Sequence]] = {}
         described = config.objective
         self.objective = None if described is None else Objective.from_dict(described)
@@ -74,7 +81,8 @@ class StabilizerTask(Task):
             return self.cache.batches(start, seed, clips, self.config.length)
         stages = tuple(replace(stage, batch=clips) for stage in self.source.stages)
         source = replace(self.source, length=self.config.length, stages=stages, seed=seed)
-        return (encode_clips(self.model, batch) for batch in batch_loader(source, start))
+        loader = batch_loader(source, start, self.unreadable)
+        return (encode_clips(self.model, batch) for batch in loader)
 
     def images(self, batch: LatentClips) -> int:
         return batch.latent.shape[0] * batch.latent.shape[1]
@@ -155,7 +163,10 @@ class StabilizerTask(Task):
         return AffinePoints(points.unflatten(0, shape), mask.unflatten(0, shape))
 
     def validate(self) -> dict[str, float]:
-        """Image and video AbsRel with and without DyFN; `score` is the rendered video's."""
+        """Image and video AbsRel with and without DyFN; `score` is the rendered video's.
+
+        NaN where no validation clip has a known depth.
+        """
         if not self.sequences:
             self.sequences = self._find_sequences()
         scores = {}
@@ -163,8 +174,9 @@ class StabilizerTask(Task):
             for kind, stabilized in (("base", False), ("dyfn", True)):
                 found = [self._score(sequence, stabilized) for sequence in sequences]
                 for protocol in ("image", "video"):
-                    mean = float(np.mean([score[protocol] for score in found]))
-                    scores[f"{name}_{kind}_{protocol}"] = mean
+                    scores[f"{name}_{kind}_{protocol}"] = known_mean(s[protocol] for s in found)
+        if not np.isfinite(scores["rendered_dyfn_video"]):
+            logger.warning("no depth is known in the validation clips: nothing to score")
         return {**scores, "score": scores["rendered_dyfn_video"]}
 
     def _score(self, sequence: Sequence, stabilized: bool) -> dict[str, float]:

@@ -7,6 +7,7 @@ clip shrinks from megabytes to kilobytes a frame, and a step of training needs n
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import partial
@@ -47,16 +48,24 @@ class SummaryClips:
 class SummaryCache:
     """`draws` clips in a folder (CacheFolder), made once and kept in memory.
 
-    Raises ConfigError when the folder was made with another model, source or recurrence.
+    unreadable: counts what could not be read while they were made. Raises ConfigError when the
+    folder was made with another model, source or recurrence.
     """
 
-    def __init__(self, folder: Path, model: GeometryModel, source: ClipSource, draws: int) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        model: GeometryModel,
+        source: ClipSource,
+        draws: int,
+        unreadable: Counter[str],
+    ) -> None:
         assert model.stabilizer is not None
         wanted = fingerprint(model, source)
         wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
         wanted["contents"] = [field.name for field in fields(SummaryClips)]
         files = CacheFolder(folder, draws, wanted, "summaries")
-        files.build(source, partial(summarise_clips, model))
+        files.build(source, partial(summarise_clips, model), unreadable)
         parts = files.load()
         self.summary = torch.cat([part["summary"] for part in parts])
         self.error, self.depth, self.truth, self.slope = (

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
-import random
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from torch import Tensor
 
-from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import save_model
-from dyfn_core.training.checkpoint import DamagedCheckpointError, has_state, read_state, write_state
+from dyfn_core.training.checkpoint import (
+    STATE_FILE,
+    DamagedCheckpointError,
+    has_state,
+    read_state,
+    write_state,
+)
 from dyfn_core.training.config import RunConfig
 from dyfn_core.training.ema import Ema
 from dyfn_core.training.processes import Processes
 from dyfn_core.training.run_folder import RunFolder
+from dyfn_core.training.run_state import (
+    moments,
+    random_state,
+    restore_moments,
+    restore_random_state,
+)
 from dyfn_core.training.signals import StopSignals
+from dyfn_core.training.task import Task
 
 MODEL_FILE = "model.safetensors"
 BEST_FILE = "best.safetensors"
@@ -45,41 +51,12 @@ class InterruptedRunError(RuntimeError):
         self.number = number
 
 
-class Task(ABC):
-    """What is trained: the model, its parameter groups, its loss, and how it is judged."""
-
-    model: GeometryModel
-
-    @abstractmethod
-    def groups(self) -> list[dict[str, Any]]:
-        """Parameter groups for AdamW, each with its own "lr"."""
-
-    @abstractmethod
-    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[Any]:
-        """One part of the batches from step `start` on; a dataclass of tensors each.
-
-        Raises ConfigError when the batch cannot be split into so many equal parts.
-        """
-
-    @abstractmethod
-    def images(self, batch: Any) -> int:
-        """How many images a part of a batch holds."""
-
-    @abstractmethod
-    def loss(self, batch: Any) -> tuple[Tensor, dict[str, float]]:
-        """The loss to minimise, a mean over the part, and values to log."""
-
-    @abstractmethod
-    def validate(self) -> dict[str, float]:
-        """Scores; "score" (lower is better) chooses the best model."""
-
-    @abstractmethod
-    def picture(self, batch: Any) -> np.ndarray:
-        """A strip of images, H x W x 3 uint8 RGB."""
-
-    def export_model(self) -> GeometryModel:
-        """The model to write; called while the averaged parameters are in place."""
-        return self.model
+def check_folder(out: Path, resume: bool) -> None:
+    """Raises TrainingError when a folder holds a run already, or none to resume."""
+    if resume and not has_state(out):
+        raise TrainingError(f"nothing to resume: {out} holds no {STATE_FILE}")
+    if not resume and has_state(out):
+        raise TrainingError(f"{out} already holds a run; give --resume or another folder")
 
 
 class Trainer:
@@ -111,10 +88,9 @@ class Trainer:
         self.step, self.images, self.bad_steps, self.skipped_steps = 0, 0, 0, 0
         self.seconds, self.best = 0.0, math.inf
         self.scores: dict[str, float] = {}
+        check_folder(out, resume)
         if resume:
             self._load()
-        elif has_state(out):
-            raise TrainingError(f"{out} already holds a run; give --resume or another folder")
         self.processes.wait()
         self.folder = self._open_folder() if self.processes.is_main else None
 
@@ -133,7 +109,7 @@ class Trainer:
         Raises TrainingError after more than `most_bad_steps` steps in a row without a finite
         loss and gradient, InterruptedRunError after SIGINT or SIGTERM. Both leave a checkpoint.
         """
-        last = min(self.config.steps, max_steps or self.config.steps)
+        last = self.config.steps if max_steps is None else min(self.config.steps, max_steps)
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
         quiet = not self.processes.is_main
         with (
@@ -267,9 +243,12 @@ class Trainer:
             self.folder.log(group, self.step, values, seconds=seconds, images=self.images)
 
     def _summary(self) -> dict[str, Any]:
-        return {**{name: getattr(self, name) for name in COUNTERS}, **self.scores}
+        counters = {name: getattr(self, name) for name in COUNTERS}
+        return {**counters, "unreadable_clips": self.task.unreadable.total(), **self.scores}
 
     def _close(self) -> None:
+        for message, count in self.task.unreadable.most_common():
+            logger.warning("could not be read %d times: %s", count, message)
         if self.folder is not None:
             self.folder.close()
         self.processes.wait()
@@ -280,34 +259,16 @@ class Trainer:
             return
         state = {
             **{name: getattr(self, name) for name in COUNTERS},
+            "unreadable": dict(self.task.unreadable),
             "model": self.task.model.state_dict(),
-            "optimizer": self._moments(),
+            "optimizer": moments(self.task.model, self.optimizer),
             "ema": self.ema.state_dict(),
             "config": self.config.model_dump(mode="json"),
-            "torch_rng": torch.get_rng_state(),
-            "numpy_rng": json.dumps(np.random.get_state(legacy=False), default=np.ndarray.tolist),
-            "python_rng": random.getstate(),
+            **random_state(),
         }
         write_state(self.out, state)
         with self.ema.applied():
             self._export(self.out / MODEL_FILE)
-
-    def _moments(self) -> dict[str, dict[str, Tensor]]:
-        """AdamW's state by parameter name, so that a resumed run may freeze other parts."""
-        return {
-            name: dict(self.optimizer.state[parameter])
-            for name, parameter in self.task.model.named_parameters()
-            if parameter in self.optimizer.state
-        }
-
-    def _restore_moments(self, moments: dict[str, dict[str, Tensor]]) -> None:
-        trained = {id(parameter) for parameter in self.trained}
-        for name, parameter in self.task.model.named_parameters():
-            if name in moments and id(parameter) in trained:
-                self.optimizer.state[parameter] = {
-                    key: value if key == "step" else value.to(parameter.device)
-                    for key, value in moments[name].items()
-                }
 
     def _export(self, path: Path) -> None:
         notes = {"trained_steps": str(self.step), "trained_seconds": f"{self.seconds:.0f}"}
@@ -320,15 +281,14 @@ class Trainer:
             raise TrainingError(str(error)) from error
         self._tell_changes(state["config"])
         self.task.model.load_state_dict(state["model"], strict=True)
-        self._restore_moments(state["optimizer"])
+        restore_moments(self.task.model, self.optimizer, state["optimizer"])
         self.ema.load_state_dict(state["ema"])
         for name in COUNTERS:
             own = getattr(self, name)
             setattr(self, name, type(own)(state.get(name, own)))
-        torch.set_rng_state(state["torch_rng"])
-        np.random.set_state(json.loads(state["numpy_rng"]))
-        version, internal, gauss = state["python_rng"]
-        random.setstate((version, tuple(internal), gauss))
+        # A cache that had to be made anew has been counted by now.
+        self.task.unreadable.update(state.get("unreadable", {}))
+        restore_random_state(state)
 
     def _tell_changes(self, before: dict[str, Any]) -> None:
         now = self.config.model_dump(mode="json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,7 +76,10 @@ def _small(image: np.ndarray, depth: np.ndarray) -> Example:
 
 
 def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
-    """Mean AbsRel and delta1 over the examples, image protocol (paper section 5)."""
+    """Mean AbsRel and delta1 over the examples, image protocol (paper section 5).
+
+    Examples of fewer than 100 known depths are left out; NaN without any other.
+    """
     errors, shares = [], []
     for example in examples:
         image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
@@ -92,7 +96,13 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
         aligned = np.maximum(scale * ours + shift, 1e-3)
         errors.append(np.mean(np.abs(aligned - true) / true))
         shares.append(np.mean(np.maximum(aligned / true, true / aligned) < 1.25))
-    return {"abs_rel": float(np.mean(errors)), "delta1": float(np.mean(shares))}
+    return {"abs_rel": known_mean(errors), "delta1": known_mean(shares)}
+
+
+def known_mean(values: Iterable[float]) -> float:
+    """The mean of those that are no NaN; NaN when there is none."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else np.nan
 
 
 @dataclass(frozen=True)
@@ -111,13 +121,16 @@ def sequence_scores(
     """AbsRel of a sequence under the image and video protocols (paper section 5).
 
     predicted, true: per frame, h x w; true depth counts where it is finite and > 1e-3. quantity:
-    of the prediction; disparity is aligned with 1 / depth.
+    of the prediction; disparity is aligned with 1 / depth. Frames of fewer than 16 such pixels are
+    left out; without any other both are NaN.
     """
     pairs = []
     for ours, depth in zip(predicted, true, strict=True):
         valid = np.isfinite(depth) & (depth > 1e-3)
         if valid.sum() >= 16:
             pairs.append((ours[valid].astype(np.float64), depth[valid].astype(np.float64)))
+    if not pairs:
+        return {"image": np.nan, "video": np.nan}
     joined = _fit(
         np.concatenate([p for p, _ in pairs]), np.concatenate([d for _, d in pairs]), quantity
     )

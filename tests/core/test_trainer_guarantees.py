@@ -26,6 +26,7 @@ from dyfn_core.training.checkpoint import (
     write_state,
 )
 from dyfn_core.training.run_folder import read_log
+from dyfn_core.training.run_state import moments
 from dyfn_core.training.trainer import InterruptedRunError, Trainer, TrainingError
 
 LONG: dict[str, Any] = {"steps": 120, "validate_every": 50, "picture_every": 1000}
@@ -161,7 +162,10 @@ def test_step_that_is_not_finite_changes_nothing_and_is_counted(tmp_path: Path) 
 
 
 def snapshot(trainer: Trainer) -> dict[str, torch.Tensor]:
-    parts = {"model": trainer.task.model.state_dict(), "moments": trainer._moments()}
+    parts = {
+        "model": trainer.task.model.state_dict(),
+        "moments": moments(trainer.task.model, trainer.optimizer),
+    }
     parts["ema"] = trainer.ema.averages
     return {name: value.clone() for name, value in flatten(parts).items()}
 

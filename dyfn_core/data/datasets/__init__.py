@@ -128,13 +128,15 @@ def open_kind(
 ) -> tuple[list[FrameSequence], DataReport]:
     """The sequences below root, and the report on what could not be used.
 
-    Raises DataError when there is not one frame of the kind, saying what was expected and found.
+    Raises DataError when there is not one usable frame, saying what was expected and, where
+    something of the kind is there, what is wrong with it.
     """
     kind = data_kind(name)
     report = DataReport(f"{name} at {root}")
     sequences = [s for s in kind.open(root, report, **options) if len(s)]
     report.sequences, report.frames = len(sequences), sum(map(len, sequences))
     if not sequences:
-        missed = f" ({report.summary()})" if report.problems else ""
-        raise DataError(f"{nothing_found(root, kind.expected)}{missed}")
+        if report.problems:
+            raise DataError(f"{report.summary()}; expected {kind.expected}")
+        raise nothing_found(root, kind.expected)
     return sequences, report

@@ -59,6 +59,22 @@ def nothing_found(root: Path, expected: str) -> DataError:
     return DataError(f"{root}: expected {expected}; found {listed or 'an empty folder'}")
 
 
+def usable_poses(
+    rows: np.ndarray, path: Path, report: DataReport, quaternion: slice | None = None
+) -> np.ndarray:
+    """Poses, N x k, with NaN in the place of those that are none; these are counted.
+
+    quaternion: the columns that hold one, which must not be of length 0. rgbd_frame gives the
+    frames of such rows no pose.
+    """
+    usable = np.isfinite(rows).all(1)
+    if quaternion is not None:
+        usable &= (rows[:, quaternion] != 0).any(1)
+    for number in np.flatnonzero(~usable):
+        report.miss("pose that is none (the frame stays)", f"{path} row {number}")
+    return np.where(usable[:, None], rows, np.nan)
+
+
 def rgbd_frame(
     image: np.ndarray,
     depth: np.ndarray,
@@ -66,9 +82,14 @@ def rgbd_frame(
     pose: np.ndarray | None,
     path: Path,
 ) -> RgbdFrame:
-    """A frame whose depth has the image's size. Raises FrameError, naming `path`, if not."""
+    """A frame whose depth has the image's size. Raises FrameError, naming `path`, if not.
+
+    A pose that is not finite becomes None.
+    """
     if image.shape[:2] != depth.shape:
         raise FrameError(f"{path}: depth of {depth.shape}, but the image has {image.shape[:2]}")
+    if pose is not None and not np.isfinite(pose).all():
+        pose = None
     return RgbdFrame(image, depth.astype(np.float32, copy=False), intrinsics, pose)
 
 

@@ -16,6 +16,7 @@ from dyfn_core.data.datasets.files import (
     read_colour,
     read_float16_png,
     rgbd_frame,
+    usable_poses,
     with_depth,
 )
 from dyfn_core.data.frames import DataReport, FrameSequence, RgbdFrame, uninterrupted
@@ -58,10 +59,11 @@ def _poses(path: Path, trajectory: str, report: DataReport) -> np.ndarray | None
         with library.File(path, "r") as file:
             truth = file[trajectory]["groundtruth"]
             rows = np.hstack([truth["position"][()], truth["attitude"][()]])
-        return rows[::RECORDS_A_FRAME].astype(np.float64)
+        rows = rows[::RECORDS_A_FRAME].astype(np.float64)
     except (OSError, KeyError, ValueError) as error:
         report.miss(f"trajectory without poses: {error}", f"{path}: {trajectory}")
         return None
+    return usable_poses(rows, path / trajectory, report, slice(3, 7))
 
 
 @lru_cache(maxsize=1)
@@ -82,7 +84,7 @@ def _read(files: dict[int, tuple[Path, Path]], poses: np.ndarray | None, number:
 
 
 def _pose(poses: np.ndarray | None, number: int) -> np.ndarray | None:
-    if poses is None or number >= len(poses):
+    if poses is None or number >= len(poses) or not np.isfinite(poses[number]).all():
         return None
     row = poses[number]
     return ned_body_pose(rigid(quaternion_rotation(*row[3:]), row[:3]))

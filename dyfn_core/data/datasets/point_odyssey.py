@@ -15,6 +15,7 @@ from dyfn_core.data.datasets.files import (
     read_colour,
     read_uint16,
     rgbd_frame,
+    usable_poses,
     with_depth,
 )
 from dyfn_core.data.frames import (
@@ -63,7 +64,9 @@ def _cameras(folder: Path, report: DataReport) -> tuple[np.ndarray, np.ndarray] 
     try:
         with np.load(path) as arrays:
             intrinsics, extrinsics = arrays["intrinsics"], arrays["extrinsics"]
-        return intrinsics.reshape(-1, 3, 3), extrinsics.reshape(len(intrinsics), 4, 4)
+        intrinsics = intrinsics.reshape(-1, 3, 3)
+        poses = usable_poses(extrinsics.reshape(len(intrinsics), 16), path, report)
+        return intrinsics, poses.reshape(-1, 4, 4)
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         report.miss("annotations without N x 3 x 3 intrinsics and N x 4 x 4 extrinsics", path)
         report.miss(f"{type(error).__name__}: {error}", path)
@@ -82,6 +85,6 @@ def _read(
     depth[stored == 0] = np.nan
     depth[stored == 65535] = np.inf
     k = intrinsics[number]
-    camera = camera_intrinsics(k[0, 0], k[1, 1], k[0, 2], k[1, 2], image.shape[:2])
+    camera = camera_intrinsics(k[0, 0], k[1, 1], k[0, 2], k[1, 2], image.shape[:2], image_path)
     pose = inverse(extrinsics[number].astype(np.float64))
     return rgbd_frame(image, depth, camera, pose, depth_path)

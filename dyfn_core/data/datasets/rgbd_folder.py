@@ -22,6 +22,7 @@ from dyfn_core.data.datasets.files import (
     read_uint16,
     registered,
     rgbd_frame,
+    usable_poses,
     with_depth,
 )
 from dyfn_core.data.frames import (
@@ -131,7 +132,7 @@ def _read(views: Views, number: int) -> RgbdFrame:
     image, stored = read_colour(image_path), read_uint16(depth_path)
     depth = stored.astype(np.float32) / np.float32(views.unit)
     depth[np.isin(stored, (0, *views.invalid))] = np.nan
-    intrinsics = camera_intrinsics(*views.camera, image.shape[:2])
+    intrinsics = camera_intrinsics(*views.camera, image.shape[:2], image_path)
     image, depth = registered(image, depth, depth_path)
     frame = rgbd_frame(image, depth, intrinsics, views.poses.get(number), depth_path)
     return replace(frame, stamp=views.stamps.get(number))
@@ -253,7 +254,9 @@ def _trajectory(path: Path, report: DataReport) -> Iterator[tuple[float, np.ndar
     if not path.exists():
         report.miss("folder without groundtruth.txt (its frames have no poses)", path.parent)
         return
-    for stamp, tx, ty, tz, qx, qy, qz, qw in sorted(read_table(path, 8).tolist()):
+    rows = usable_poses(read_table(path, 8), path, report, slice(4, 8))
+    rows = rows[np.isfinite(rows).all(1)]
+    for stamp, tx, ty, tz, qx, qy, qz, qw in sorted(rows.tolist()):
         yield stamp, rigid(quaternion_rotation(qw, qx, qy, qz), np.array([tx, ty, tz]))
 
 

@@ -16,6 +16,7 @@ from dyfn_core.data.datasets.files import (
     read_colour,
     read_table,
     rgbd_frame,
+    usable_poses,
     with_depth,
 )
 from dyfn_core.data.frames import (
@@ -49,7 +50,8 @@ def open_spring(root: Path, report: DataReport) -> list[FrameSequence]:
         files = with_depth(images, depths, report)
         try:
             cameras = read_table(folder / "cam_data" / "intrinsics.txt", 4)
-            poses = read_table(folder / "cam_data" / "extrinsics.txt", 16)
+            path = folder / "cam_data" / "extrinsics.txt"
+            poses = usable_poses(read_table(path, 16), path, report)
         except FrameError as error:
             report.miss(f"sequence without cameras: {error}", folder)
             continue
@@ -72,7 +74,7 @@ def _read(
     near = disparity > 0
     depth[near] = fx * BASELINE / disparity[near]
     depth[disparity == 0] = np.inf
-    intrinsics = camera_intrinsics(fx, fy, cx, cy, SIZE)
+    intrinsics = camera_intrinsics(fx, fy, cx, cy, SIZE, image_path)
     image = read_colour(image_path, SIZE)
     return rgbd_frame(image, depth, intrinsics, inverse(poses[number - 1]), depth_path)
 

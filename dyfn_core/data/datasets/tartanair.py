@@ -14,6 +14,7 @@ from dyfn_core.data.datasets.files import (
     read_colour,
     read_table,
     rgbd_frame,
+    usable_poses,
     with_depth,
 )
 from dyfn_core.data.frames import DataReport, FrameError, FrameSequence, RgbdFrame, uninterrupted
@@ -40,7 +41,8 @@ def open_tartanair(root: Path, report: DataReport) -> list[FrameSequence]:
         files = with_depth(images, depths, report)
         poses = None
         try:
-            poses = read_table(folder / "pose_left.txt", 7)
+            path = folder / "pose_left.txt"
+            poses = usable_poses(read_table(path, 7), path, report, slice(3, 7))
         except FrameError as error:
             report.miss(f"trajectory without poses: {error}", folder)
         name = str(folder.relative_to(root))
@@ -61,7 +63,7 @@ def _read(files: dict[int, tuple[Path, Path]], poses: np.ndarray | None, number:
 
 
 def _pose(poses: np.ndarray | None, number: int) -> np.ndarray | None:
-    if poses is None or number >= len(poses):
+    if poses is None or number >= len(poses) or not np.isfinite(poses[number]).all():
         return None
     x, y, z, w = poses[number, 3:]
     return ned_body_pose(rigid(quaternion_rotation(w, x, y, z), poses[number, :3]))
