@@ -72,6 +72,12 @@ def choose_topics(
     )
 
 
+def listed_topics(storage: Storage) -> str:
+    """Every topic that holds messages, with its type, for messages to a user."""
+    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    return _listing(kinds, kinds)
+
+
 def image_topics(path: Path, storage: Storage) -> list[str]:
     """Every colour image topic, one of each that is recorded both raw and compressed.
 

@@ -31,7 +31,8 @@ from dyfn_core.data.frames import (
     camera_intrinsics,
 )
 from dyfn_ros.recordings import RecordedFrame, RecordingError, open_recording
-from dyfn_ros.storage import is_recording
+from dyfn_ros.storage import is_recording, open_storage
+from dyfn_ros.topics import listed_topics
 
 EXPECTED = "a rosbag2 folder, .mcap, .db3 or .bag file with a colour and a depth image topic"
 FORMAT = 1  # of the folder of pictures
@@ -135,10 +136,11 @@ def _write_pictures(
     """Read the recording once; the folder appears when it is complete."""
     try:
         recording = open_recording(root, *topics, tolerance)
+        if recording.topics.depth is None:
+            held = listed_topics(open_storage(root))
+            raise DataError(f"{root}: no depth topic to train on; it holds {held}")
     except RecordingError as error:
         raise DataError(str(error)) from error
-    if recording.topics.depth is None:
-        raise DataError(f"{root}: no depth topic to train on; expected {EXPECTED}")
     partial_folder = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     partial_folder.mkdir(parents=True)
     try:
@@ -147,7 +149,7 @@ def _write_pictures(
         total = recording.expected_frames
         for frame in tqdm(recording.frames(), f"reading {root.name}", total, unit="frame"):
             try:
-                camera = _write_frame(frame, partial_folder, intrinsics, max_side)
+                camera = _write_frame(frame, partial_folder, tolerance, intrinsics, max_side)
             except FrameError as error:
                 problems[str(error)] += 1
                 continue
@@ -172,12 +174,13 @@ def _other_warnings(warnings: Counter[str]) -> Counter[str]:
 def _write_frame(
     frame: RecordedFrame,
     folder: Path,
+    tolerance: float,
     intrinsics: tuple[float, float, float, float] | None,
     max_side: int,
 ) -> list[float]:
     """Write one frame; returns its normalised intrinsics. Raises FrameError without frame."""
     if frame.depth is None:
-        raise FrameError("image without depth at its stamp")
+        raise FrameError(f"image without depth within {tolerance:g} s (`tolerance`) of its stamp")
     if intrinsics is None:
         if frame.camera_matrix is None:
             raise FrameError("image without usable CameraInfo (or give `intrinsics`)")

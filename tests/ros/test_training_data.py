@@ -105,7 +105,8 @@ def test_frames_come_back_by_value(write_depth: Writer, name: str, tmp_path: Pat
 
 def test_depth_beyond_the_tolerance_is_no_depth(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", late=30_000_000)
-    with pytest.raises(DataError, match=r"6 x image without depth at its stamp"):
+    nothing_near = r"^recording at .*6 x image without depth within 0.02 s \(`tolerance`\)"
+    with pytest.raises(DataError, match=nothing_near):
         open_kind("recording", path, {})
     (sequence,), report = open_kind("recording", path, {"tolerance": 0.04})
     assert len(sequence) == 6
@@ -116,7 +117,7 @@ def test_frames_without_depth_are_counted_and_a_gap_in_time_is_a_cut(tmp_path: P
     path = write_recording(tmp_path / "run.mcap", 9, without_depth=(1,), gap_before=5)
     sequences, report = open_kind("recording", path, {})
     assert [list(s.numbers) for s in sequences] == [[0, 2, 3, 4], [5, 6, 7, 8]]  # type: ignore[attr-defined]
-    assert "1 x image without depth at its stamp" in report.summary()
+    assert "1 x image without depth within 0.02 s (`tolerance`) of its stamp" in report.summary()
     assert len(open_kind("recording", path, {"max_gap": 0.15})[0]) == 3
     assert len(open_kind("recording", path, {"max_gap": 3.0})[0]) == 1
 
@@ -131,7 +132,7 @@ def test_recording_without_intrinsics_can_be_told_them(tmp_path: Path) -> None:
 
 def test_recording_without_depth_topic_or_of_nothing_is_refused(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", write_depth=None)
-    with pytest.raises(DataError, match="no depth topic to train on"):
+    with pytest.raises(DataError, match=r"no depth topic to train on; it holds /camera/camera_inf"):
         open_kind("recording", path, {})
     (tmp_path / "empty.mcap").touch()
     with pytest.raises(DataError, match=r"empty\.mcap is empty"):
@@ -223,6 +224,42 @@ def test_fine_tuning_on_a_recording_changes_dyfn_alone(tmp_path: Path) -> None:
     changed = {name for name in before if not torch.equal(before[name], after[name])}
     assert changed
     assert all(name.startswith("stabilizer.") for name in changed)
+
+
+def test_recording_given_with_options_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", 8, late=30_000_000)
+    settings = [
+        text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
+    ]
+    out = tmp_path / "out"
+    command = ["stabilizer", "--out", str(out), *settings, "--data"]
+    assert main([*command, str(path)]) == 1
+    told = capsys.readouterr().err
+    assert "8 x image without depth within 0.02 s (`tolerance`)" in told
+    assert main([*command, f"{{root: {path}, kind: recording, tolerance: 0.04}}"]) == 0
+    assert f"step 2: {out / 'model.safetensors'}" in capsys.readouterr().out
+    assert main([*command, "{root: [}"]) == 1
+    assert "--data '{root: [}' is no YAML" in capsys.readouterr().err
+
+
+def test_a_recording_without_any_valid_depth_is_trained_on_but_not_scored(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unknown(writer: RecordingWriter, depth: np.ndarray, stamp: int) -> None:
+        as_16uc1(writer, np.full_like(depth, np.nan), stamp)
+
+    path = write_recording(tmp_path / "run.mcap", 8, unknown)
+    settings = [
+        text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
+    ]
+    out = tmp_path / "out"
+    assert main(["stabilizer", "--data", str(path), "--out", str(out), *settings]) == 0
+    assert "no depth is known in the validation clips" in caplog.text
+    results = json.loads((out / "results.json").read_text())
+    assert results["score"] is None
+    assert (out / "model.safetensors").exists()
 
 
 def test_recording_named_in_a_config_with_options(
