@@ -165,6 +165,12 @@ def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]
     return results
 
 
+def _steps(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number of 1 or more, got {text!r}")
+    return int(text)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dyfn-train", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -186,7 +192,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.add_argument("--out", type=Path, required=True, help="folder of the run")
         command.add_argument("--resume", action="store_true", help="go on from OUT/state.pt")
-        command.add_argument("--max-steps", type=int, help="stop at this step")
+        command.add_argument("--max-steps", type=_steps, help="stop at this step")
         command.add_argument(
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
         )

@@ -300,7 +300,8 @@ def _locate(name: str) -> Path:
     if path.exists():
         return path
     match = _HUB_ID.fullmatch(name)
-    is_file_name = path.suffix in (".pt", ".pth", ".safetensors") and name.count("/") < 2
+    is_weights = path.suffix in (".pt", ".pth", ".safetensors")
+    is_file_name = is_weights and (name.count("/") < 2 or Path(path.parts[0]).is_dir())
     if match is None or is_file_name:
         raise FileNotFoundError(
             f"no model {name!r}: no file of that path, no bundled model "

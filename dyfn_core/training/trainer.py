@@ -34,6 +34,7 @@ from dyfn_core.training.task import Task
 
 MODEL_FILE = "model.safetensors"
 BEST_FILE = "best.safetensors"
+MOST_TOLD = 10  # messages about clips that could not be read, at the end of a run
 COUNTERS = ("step", "seconds", "images", "best", "bad_steps", "skipped_steps")
 
 logger = logging.getLogger(__name__)
@@ -247,8 +248,11 @@ class Trainer:
         return {**counters, "unreadable_clips": self.task.unreadable.total(), **self.scores}
 
     def _close(self) -> None:
-        for message, count in self.task.unreadable.most_common():
-            logger.warning("could not be read %d times: %s", count, message)
+        worst = self.task.unreadable.most_common(MOST_TOLD)
+        for message, count in worst:
+            logger.warning("could not be read, %d x: %s", count, message)
+        if others := self.task.unreadable.total() - sum(count for _, count in worst):
+            logger.warning("could not be read, %d x: others", others)
         if self.folder is not None:
             self.folder.close()
         self.processes.wait()

@@ -322,3 +322,13 @@ def test_load_model_is_the_packages_front_door() -> None:
         assert getattr(dyfn_core, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'absent'"):
         _ = dyfn_core.absent
+
+
+def test_a_missing_file_in_a_folder_that_is_here_is_not_looked_for_on_the_hub(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "base").mkdir(parents=True)
+    monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda **_: pytest.fail("asked"))
+    with pytest.raises(FileNotFoundError, match="no file of that path"):
+        load_model("runs/base/model.safetensors")

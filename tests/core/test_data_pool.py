@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,14 @@ from made_data_sets import (
 from made_frames import write_data_set
 from scipy.spatial.transform import Rotation
 
-from dyfn_core.data.clips import ClipSource, SizeStage, draw_batch, draw_clip, find_sequences
+from dyfn_core.data.clips import (
+    BatchLoader,
+    ClipSource,
+    SizeStage,
+    draw_batch,
+    draw_clip,
+    find_sequences,
+)
 from dyfn_core.data.datasets import open_kind, recognise
 from dyfn_core.data.frames import DataError, FrameError, NumberedSequence, RgbdFrame
 from dyfn_core.data.pool import DataPool, DataSpec, cut_sequences, open_pool
@@ -265,6 +273,29 @@ def test_unreadable_clips_are_replaced_and_named_and_too_many_end_the_run() -> N
     assert (draw_batch(source, pool, 0, again).image == batches[0].image).all()
     with pytest.raises(DataError, match=r"50 clips in a row cannot be read, the last: bad/1.png"):
         draw_batch(source, DataPool([bad], np.ones(1), []), 0)
+
+
+def test_data_that_cannot_be_read_end_a_loader_with_the_reason_and_are_counted(
+    tmp_path: Path,
+) -> None:
+    make_plain(tmp_path)
+    counted: Counter[str] = Counter()
+    for depth in (tmp_path / "depth").iterdir():
+        depth.write_bytes(b"damaged")
+    loader = BatchLoader(clip_source(2, (1, 1), DataSpec(tmp_path)), unreadable=counted)
+    with pytest.raises(DataError, match=r"^50 clips in a row cannot be read, the last: .*png"):
+        next(loader)
+    assert counted.total() == 50
+
+
+def test_sequences_that_are_too_short_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make_plain(tmp_path / "mine")
+    write_data_set(tmp_path / "rendered")
+    specs = (DataSpec(tmp_path / "rendered"), DataSpec(tmp_path / "mine", split="held_out"))
+    open_pool(specs, "held_out", 5)
+    assert "1 x sequence of fewer than 5 frames" in caplog.text
 
 
 def test_a_batch_from_a_folder_trains_like_one_from_rendered_clips(tmp_path: Path) -> None:

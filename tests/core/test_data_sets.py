@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from made_data_sets import BALL, FLOOR, MAKERS, PATCH, RADIUS, MadeSet, View
@@ -148,6 +149,46 @@ def test_tartanair_with_fewer_poses_than_frames_keeps_the_frames(tmp_path: Path)
     poses.write_text("\n".join(poses.read_text().splitlines()[:2]))
     (sequence,), _ = open_kind("tartanair", tmp_path, {})
     assert [sequence.read(index).pose is None for index in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize("quaternion", ["0 0 0 0", "nan 0 0 1"])
+def test_a_pose_that_is_none_is_counted_and_the_frame_stays(
+    quaternion: str, tmp_path: Path
+) -> None:
+    MAKERS["tartanair"](tmp_path)
+    poses = tmp_path / "office" / "Easy" / "P000" / "pose_left.txt"
+    lines = poses.read_text().splitlines()
+    lines[1] = f"0 0 0 {quaternion}"
+    poses.write_text("\n".join(lines))
+    (sequence,), report = open_kind("tartanair", tmp_path, {})
+    assert [sequence.read(index).pose is None for index in range(3)] == [False, True, False]
+    assert "1 x pose that is none (the frame stays)" in report.summary()
+    assert "pose_left.txt row 1" in report.summary()
+
+
+def test_midair_with_a_zero_quaternion_keeps_the_frames(tmp_path: Path) -> None:
+    MAKERS["midair"](tmp_path)
+    (path,) = tmp_path.rglob("sensor_records.hdf5")
+    with h5py.File(path, "r+") as file:
+        attitudes: list[h5py.Dataset] = []
+        file.visititems(
+            lambda name, found: attitudes.append(found) if name.endswith("attitude") else None
+        )
+        for attitude in attitudes:
+            attitude[0] = 0
+    sequences, report = open_kind("midair", tmp_path, {})
+    assert sequences[0].read(0).pose is None
+    assert sequences[0].read(1).pose is not None
+    assert "pose that is none" in report.summary()
+
+
+def test_unusable_intrinsics_of_spring_name_the_image(tmp_path: Path) -> None:
+    known = MAKERS["spring"](tmp_path)
+    (path,) = tmp_path.rglob("intrinsics.txt")
+    path.write_text("\n".join(["nan 0 0 0"] * len(known.views)))
+    (sequence,), _ = open_kind("spring", tmp_path, {})
+    with pytest.raises(FrameError, match=r"frame_left_0001.png: unusable intrinsics fx=nan"):
+        sequence.read(0)
 
 
 def test_another_size_than_the_published_one_is_refused(tmp_path: Path) -> None:

@@ -179,7 +179,11 @@ def test_temporal_loss_compares_how_far_points_move() -> None:
 
 def test_temporal_loss_without_pairs_or_alignment_is_zero() -> None:
     target = clip()
-    assert float(temporal_loss(target.points, target, torch.ones(2), [])) == 0
+    points = target.points.clone().requires_grad_()
+    alone = temporal_loss(points, target, torch.ones(2), [])
+    alone.backward()
+    assert alone.item() == 0
+    assert points.grad is not None and not points.grad.any()
     assert float(temporal_loss(target.points * 2, target, torch.zeros(2), [(0, 1)])) == 0
 
 

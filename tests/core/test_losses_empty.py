@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -180,6 +181,32 @@ def test_ssi_ignores_scale_and_shift_but_not_shape() -> None:
     spoiled[:, 3:5, 3:5] += 100
     trimmed, kept = ssi_loss(spoiled, frames), ssi_loss(spoiled, frames, trim=0.0)
     assert float(trimmed) < float(kept)
+
+
+def test_ssi_of_a_frame_is_midas_error_computed_by_hand() -> None:
+    draw = np.random.default_rng(5)
+    z, ours = draw.uniform(1, 5, (2, HEIGHT, WIDTH))
+    z[4:7, :9] = np.nan
+    known = np.isfinite(z)
+
+    def normalised(values: np.ndarray) -> np.ndarray:
+        ordered = np.sort(values[known])
+        centred = values - ordered[(len(ordered) - 1) // 2]
+        return np.where(known, centred / np.abs(centred[known]).mean(), 0)
+
+    residual = normalised(ours) - normalised(np.where(known, 1 / z, 0))
+    kept = np.sort(np.abs(residual[known]))[: int(0.8 * known.sum())]
+    wanted = kept.sum() / (2 * known.sum())
+    for step in (1, 2, 4, 8):
+        r, k = residual[::step, ::step], known[::step, ::step]
+        across = (np.abs(np.diff(r, axis=1)) * (k[:, 1:] & k[:, :-1])).sum()
+        down = (np.abs(np.diff(r, axis=0)) * (k[1:] & k[:-1])).sum()
+        wanted += 0.5 * (across + down) / k.sum()
+    frame = target_from_depth(
+        torch.from_numpy(z).float()[None], torch.tensor([[0.8, 1.12, 0.5, 0.5]]), 1.4
+    )
+    found = float(ssi_loss(torch.from_numpy(ours).float()[None], frame))
+    assert found == pytest.approx(wanted, rel=1e-5)
 
 
 def test_disparity_alignment_finds_scale_and_shift() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from made_frames import write_shard
 from training_toys import (
     PATIENCE,
     environment,
@@ -247,3 +249,68 @@ def test_validation_on_what_is_trained_on_is_said(
     with torch.no_grad():
         StabilizerTask(config, tmp_path / "latents").validate()
     assert "nothing is held out" in caplog.text
+
+
+def damaged_copy(place: Path, tmp_path: Path) -> str:
+    """Setting of a copy of the data with a second training clip that cannot be read."""
+    root = shutil.copytree(place / "data", tmp_path / "data")
+    write_shard(root, "c_1", "clip", "train", 8, seed=3)
+    for depth in (root / "clips" / "c_1").glob("*.png"):
+        depth.write_bytes(b"damaged")
+    return f"data=[{root}]"
+
+
+def test_clips_that_cannot_be_read_are_counted_also_over_a_resume(
+    place: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = damaged_copy(place, tmp_path)
+    command = ["stabilizer", str(place / "config.yaml"), "--set", data, "--set", "steps=6"]
+    command += ["--set", "cache_draws=0", "--out"]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    assert main([*command, str(whole)]) == 0
+    counted = json.loads((whole / "results.json").read_text())["unreadable_clips"]
+    assert counted > 0
+    told = re.findall(r"could not be read, (\d+) x: .*c_1.*png", caplog.text)
+    assert sum(map(int, told)) == counted
+    assert main([*command, str(parts), "--max-steps", "3"]) == 0
+    assert main([*command, str(parts), "--resume"]) == 0
+    assert json.loads((parts / "results.json").read_text())["unreadable_clips"] == counted
+
+
+def test_a_cache_that_holds_nothing_binds_nobody(place: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = ["stabilizer", str(place / "config.yaml"), "--out", str(out)]
+    data = damaged_copy(place, tmp_path)
+    shutil.rmtree(tmp_path / "data" / "clips" / "a_1")
+    assert main([*command, "--set", data]) == 1
+    assert (out / "latents" / "cache.json").exists()
+    assert main(command) == 0
+
+
+def test_a_resume_of_nothing_is_refused_before_anything_is_made(
+    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert main(["stabilizer", str(place / "config.yaml"), "--out", str(out), "--resume"]) == 1
+    assert f"nothing to resume: {out} holds no state.pt" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_recording_in_the_place_of_the_config_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "run.mcap"
+    recording.write_bytes(bytes([0x89, 0x4D, 0xFF, 0xFE]))
+    assert main(["stabilizer", str(recording), "--out", str(tmp_path / "out")]) == 1
+    told = capsys.readouterr().err
+    assert f"{recording} is no readable YAML file of settings (data are given with --data)" in told
+
+
+@pytest.mark.parametrize("steps", ["0", "-1", "few"])
+def test_steps_are_at_least_one(
+    steps: str, place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["stabilizer", str(place / "config.yaml"), "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        main([*command, "--max-steps", steps])
+    assert "--max-steps: expected a whole number of 1 or more" in capsys.readouterr().err
