@@ -117,7 +117,8 @@ def _named(path: Path, kinds: dict[str, str], name: str | None, types: set[str])
 def _only(path: Path, kinds: dict[str, str], candidates: list[str], what: str) -> str | None:
     if len(candidates) > 1:
         raise RecordingError(
-            f"{path}: several topics may be the {what}; choose one with --{what}-topic: "
+            f"{path}: several topics may be the {what}; choose one with --{what}-topic "
+            f"({what.replace('-', '_')}_topic in training data): "
             f"{_listing(kinds, candidates)}"
         )
     return candidates[0] if candidates else None

@@ -209,7 +209,9 @@ class StabilizerTask(Task):
         sequences: list[Sequence] = []
         draw = 0
         while len(sequences) < self.config.validation_clips:
-            clips = encode_clips(self.model, draw_batch(source, found, draw))
+            unreadable: list[str] = []
+            clips = encode_clips(self.model, draw_batch(source, found, draw, unreadable))
+            self.unreadable.update(unreadable)
             sequences += [
                 Sequence(latent, depth, clips.image_size, clips.network_size)
                 for latent, depth in zip(clips.latent, clips.depth, strict=True)

@@ -129,6 +129,17 @@ def test_rgbd_folders_of_every_layout_are_read_by_value(
         assert np.abs(frame.image.astype(int) - truth.image).mean() < 15
 
 
+def test_a_pose_of_a_plain_folder_that_is_none_is_counted(tmp_path: Path) -> None:
+    make_plain(tmp_path)
+    poses = np.loadtxt(tmp_path / "poses.txt")
+    poses[0] = np.nan
+    np.savetxt(tmp_path / "poses.txt", poses)
+    (sequence,), report = open_kind("rgbd_folder", tmp_path, {})
+    assert sequence.read(0).pose is None
+    assert sequence.read(1).pose is not None
+    assert "poses.txt row 0" in report.summary()
+
+
 def test_seven_scenes_takes_its_published_camera(tmp_path: Path) -> None:
     make_seven_scenes(tmp_path)
     (sequence,), _ = open_kind("rgbd_folder", tmp_path, {})

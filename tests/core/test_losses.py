@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import HUBER, canonical_scale_loss
 from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
-from dyfn_core.losses.local import local_loss
+from dyfn_core.losses.local import LocalLevel, ball_loss, local_loss
 from dyfn_core.losses.mask import mask_loss
 from dyfn_core.losses.normal import normal_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import Target, target_from_depth
-from dyfn_core.losses.temporal import temporal_loss, window_pairs
+from dyfn_core.losses.temporal import released_temporal_loss, temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
 
 INTRINSICS = torch.tensor([0.8, 1.0667, 0.5, 0.5])
@@ -92,6 +93,38 @@ def test_local_loss_ignores_what_happens_between_the_balls() -> None:
     assert float(local) < 0.5 * float(whole_frame_loss(torn, target)[0])
     torch.manual_seed(0)
     assert float(local_loss(target.points, target, torch.ones(1), 1 / 4, 64)) < 1e-5
+
+
+def test_balls_of_the_finest_level_by_plain_loops() -> None:
+    """An affine copy of the truth with a few outliers: the best fit of every ball is known."""
+    level, scale, shift = LocalLevel(1 / 32, 6, 4), 2.0, torch.tensor([0.1, -0.2, 0.3])
+    target = scene(1, size=(240, 320))
+    truth = target.points[0].double().numpy()
+    predicted = (target.points - shift) / scale
+    error = torch.zeros_like(predicted)
+    error[:, ::5, ::7, 2] = 0.04
+    anchors = [row * 320 + column for row in (62, 101, 153) for column in (81, 200)]
+    assert all(row % 5 or column % 7 for row, column in (divmod(a, 320) for a in anchors))
+    reach = math.ceil(0.5 / 32 * math.hypot(240, 320))
+    typical = 1 / np.mean([1 / z for z in truth[target.valid[0].numpy()][:, 2]])
+    wanted, held = 0.0, []
+    for row, column in (divmod(anchor, 320) for anchor in anchors):
+        radius = 0.5 / 32 * truth[row, column, 2] / float(target.focal[0])
+        inside = [
+            (i, j)
+            for i in range(row - reach, row + reach + 1)
+            for j in range(column - reach, column + reach + 1)
+            if np.linalg.norm(truth[i, j] - truth[row, column]) <= radius
+        ]
+        held.append(len(inside))
+        for i, j in inside if len(inside) >= 32 else []:
+            weight = 1 / max(truth[i, j, 2], 0.1 * typical)
+            wanted += scale * float(error[0, i, j].sum()) * weight / (3 * (2 * reach + 1) ** 2)
+    assert max(held) >= 32
+    found = ball_loss(
+        predicted + error, target, level, torch.tensor([scale]), torch.tensor([anchors])
+    )
+    assert found.item() == pytest.approx(wanted / len(anchors), rel=1e-3)
 
 
 def test_normal_loss_ignores_scale_and_shift_but_not_a_tilt() -> None:
@@ -181,8 +214,10 @@ def test_temporal_loss_without_pairs_or_alignment_is_zero() -> None:
     target = clip()
     points = target.points.clone().requires_grad_()
     alone = temporal_loss(points, target, torch.ones(2), [])
-    alone.backward()
+    released = released_temporal_loss(points, target, torch.ones(2), [8])
+    (alone + released).backward()
     assert alone.item() == 0
+    assert released.item() == 0
     assert points.grad is not None and not points.grad.any()
     assert float(temporal_loss(target.points * 2, target, torch.zeros(2), [(0, 1)])) == 0
 

@@ -149,7 +149,8 @@ def _plain(folder: Path, options: Options, report: DataReport) -> Views:
     depths = numbered_files(folder / "depth", r"(?:.*\D)?(\d+)\.png")
     poses: dict[int, np.ndarray] = {}
     if (folder / "poses.txt").exists():
-        rows = read_table(folder / "poses.txt", 16).reshape(-1, 4, 4)
+        path = folder / "poses.txt"
+        rows = usable_poses(read_table(path, 16), path, report).reshape(-1, 4, 4)
         if len(rows) != len(images):
             raise DataError(f"{folder}/poses.txt: {len(rows)} poses for {len(images)} images")
         poses = dict(zip(images, rows, strict=True))
