@@ -97,8 +97,7 @@ def _trainer(options: argparse.Namespace) -> Trainer:
         make = partial(StabilizerTask, stabilizer, options.out / "latents")
     check_folder(options.out, options.resume)  # before anything long is begun
     processes = Processes(config)
-    with processes.main_first():
-        task = make(device=processes.device)
+    task = make(device=processes.device)
     return Trainer(task, config, options.out, options.resume, processes)
 
 

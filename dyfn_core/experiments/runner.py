@@ -115,8 +115,7 @@ class Runner:
             return folder
         logger.info("%s, seed %d", arm.name, seed)
         processes = Processes(config)
-        with processes.main_first():
-            task = StabilizerTask(config, self.plan.out / "latents", processes.device)
+        task = StabilizerTask(config, self.plan.out / "latents", processes.device)
         Trainer(task, config, folder, has_state(folder), processes).train()
         return folder
 

@@ -44,7 +44,7 @@ def write_state(folder: Path, state: dict[str, Any]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write a small file; a reader, or a run that follows a kill, sees the old or the new one."""
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # processes may write one file
     partial.write_text(text)
     partial.replace(path)
 

@@ -19,6 +19,7 @@ from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.training.checkpoint import write_text
 from dyfn_core.training.config import ConfigError
+from dyfn_core.training.processes import own_place, wait_for_every_process
 
 META = "cache.json"
 
@@ -85,15 +86,34 @@ class CacheFolder:
         make: Callable[[ClipBatch], dict[str, Tensor]],
         unreadable: Counter[str],
     ) -> None:
-        """Make the files that are missing, each whole or not at all; counts as BatchLoader does."""
-        missing = [index for index in range(self.draws) if not self._path(index).exists()]
+        """Make the files that are missing, each whole or not at all; counts as BatchLoader does.
+
+        Each process of the run makes its share. Where the folder is not on a disk that all of
+        them see, each then makes what it does not find.
+        """
+        process, count = own_place()
+        share = range(process * self.draws // count, (process + 1) * self.draws // count)
+        self._make_missing(share, source, make, unreadable)
+        wait_for_every_process()
+        self._make_missing(range(self.draws), source, make, unreadable)
+
+    def _make_missing(
+        self,
+        share: range,
+        source: ClipSource,
+        make: Callable[[ClipBatch], dict[str, Tensor]],
+        unreadable: Counter[str],
+    ) -> None:
+        missing = [index for index in share if not self._path(index).exists()]
         if not missing:
             return
         batches = batch_loader(source, missing[0], unreadable)
-        for index in track(range(missing[0], self.draws), description=f"making {self.holds}"):
-            parts = make(next(batches))
-            partial = self._path(index).with_suffix(".partial")
-            save_file(parts, partial)
+        for index in track(range(missing[0], share.stop), description=f"making {self.holds}"):
+            batch = next(batches)
+            if self._path(index).exists():
+                continue
+            partial = self._path(index).with_suffix(f".{own_place()[0]}.partial")
+            save_file(make(batch), partial)
             partial.replace(self._path(index))
 
     def load(self) -> list[dict[str, Tensor]]:

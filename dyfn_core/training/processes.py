@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, replace
 from datetime import timedelta
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 Batch = TypeVar("Batch")
 Loss = Callable[[Any], tuple[Tensor, dict[str, float]]]
 PART_STRIDE = 2**40  # between the random seeds of the parts of one step
-PATIENCE = timedelta(hours=3)  # others wait while one process builds a cache or validates
+PATIENCE = timedelta(
+    hours=3
+)  # others wait while one process fills its share of a cache or validates
 
 
 class LossModule(nn.Module):
@@ -74,12 +76,6 @@ class Processes:
     def device(self) -> torch.device:
         """Where this process computes."""
         return self.accelerator.device
-
-    @contextlib.contextmanager
-    def main_first(self) -> Iterator[None]:
-        """Inside, the main process goes first and the others after it."""
-        with self.accelerator.main_process_first():
-            yield
 
     def wait(self) -> None:
         """Until every process is here."""
@@ -151,6 +147,20 @@ def to_device(batch: Batch, device: torch.device) -> Batch:
 def full_precision(like: Tensor) -> torch.autocast:
     """Inside, mixed precision is off: alignments and 1 / z errors need float32."""
     return torch.autocast(like.device.type, enabled=False)
+
+
+def own_place() -> tuple[int, int]:
+    """This process's index and how many there are, once Processes has joined them."""
+    group = torch.distributed
+    if group.is_available() and group.is_initialized():
+        return group.get_rank(), group.get_world_size()
+    return 0, 1
+
+
+def wait_for_every_process() -> None:
+    """Until every process is here; at once when there is one."""
+    if own_place()[1] > 1:
+        torch.distributed.barrier()
 
 
 def share_of(total: int, parts: int, name: str) -> int:

@@ -6,16 +6,32 @@ import json
 import socket
 import subprocess
 import sys
+from collections import Counter
+from itertools import count
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 import training_toys
-from training_toys import PATIENCE, ToyTask, environment, run_toy, toy_config
+import yaml
+from safetensors.torch import save_file
+from training_toys import (
+    PATIENCE,
+    ToyTask,
+    environment,
+    run_toy,
+    tiny_base,
+    tiny_stabilizer_settings,
+    toy_config,
+)
 
+from dyfn_core.cli import train
 from dyfn_core.models.checkpoints import read_checkpoint
+from dyfn_core.training import latents
 from dyfn_core.training.checkpoint import read_state
 from dyfn_core.training.config import ConfigError
+from dyfn_core.training.latents import CacheFolder
 from dyfn_core.training.processes import Processes
 from dyfn_core.training.run_folder import read_log
 
@@ -95,3 +111,39 @@ def test_parts_that_cannot_be_shared_out_are_refused() -> None:
         next(ToyTask().batches(0, 0, 3))
     processes = Processes(toy_config(parts=3))
     assert list(processes.own_parts) == [0, 1, 2]
+
+
+def test_processes_make_a_cache_together(tmp_path: Path) -> None:
+    tiny_base(tmp_path)
+    settings = tiny_stabilizer_settings(tmp_path) | {"cache_draws": 5, "clips": 2}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    command = ["stabilizer", str(tmp_path / "config.yaml"), "--out"]
+    run_two(["-m", "dyfn_core.cli.train", *command, str(tmp_path / "two")])
+    assert train.main([*command, str(tmp_path / "one")]) == 0
+    files = {path.name: path for path in (tmp_path / "one" / "latents").iterdir()}
+    assert len(files) == 6
+    for path in (tmp_path / "two" / "latents").iterdir():
+        assert path.read_bytes() == files.pop(path.name).read_bytes()
+    assert not files
+
+
+def test_a_process_makes_its_share_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of three, the second: what it has not made when all are done is missing on its disk."""
+    made: list[int] = []
+    folder = CacheFolder(tmp_path, 7, {}, "toys")
+    monkeypatch.setattr(latents, "batch_loader", lambda source, start, unreadable: count(start))
+    monkeypatch.setattr(latents, "own_place", lambda: (1, 3))
+
+    def all_here() -> None:
+        assert made == [2, 3]
+        for index in (0, 1, 4):
+            save_file({"number": torch.tensor(index)}, tmp_path / f"{index:05d}.safetensors")
+
+    def make(batch: Any) -> dict[str, torch.Tensor]:
+        made.append(batch)
+        return {"number": torch.tensor(batch)}
+
+    monkeypatch.setattr(latents, "wait_for_every_process", all_here)
+    folder.build(None, make, Counter())  # type: ignore[arg-type]
+    assert made == [2, 3, 5, 6]
+    assert [int(entry["number"]) for entry in folder.load()] == list(range(7))
