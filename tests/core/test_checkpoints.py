@@ -286,7 +286,7 @@ def test_without_a_network_the_error_says_what_to_put_where(
         load_model(name)
     repo = "/".join(name.split("/")[:2])
     message = str(caught.value)
-    assert f"cannot download {file} of Hub model {repo}" in message
+    assert f"no such file here, and cannot download {file} of Hub model {repo}" in message
     assert f"{repo}/resolve/main/{file}" in message
     assert str(tmp_path / repo / file) in message
 
