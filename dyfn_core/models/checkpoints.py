@@ -331,7 +331,8 @@ def _from_hub(repo: str, file: str) -> Path:
         return Path(hf_hub_download(repo_id=repo, filename=file))
     except Exception as error:  # many kinds, by version: no network, no such file, no access
         raise FileNotFoundError(
-            f"no such file here, and cannot download {file} of Hub model {repo} ({type(error).__name__}: {error}). "
+            f"no such file here, and cannot download {file} of Hub model {repo} "
+            f"({type(error).__name__}: {error}). "
             f"Download {hf_hub_url(repo, file)} on a machine with a network and put it at "
             f"{by_hand} (or anywhere, and pass its path)"
         ) from error
