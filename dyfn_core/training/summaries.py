@@ -172,8 +172,8 @@ def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
     features = latent.features
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
     change = features.new_zeros(len(features), 2 * features.shape[1], 1, 1, requires_grad=True)
-    gamma, beta = change.chunk(2, dim=1)
     with torch.enable_grad():
+        gamma, beta = change.chunk(2, dim=1)
         moved = gamma.exp() * (features - mean) + mean + std * beta
         z = decoded_z(model, Latent(moved, latent.image_size, latent.network_size))
         (slope,) = torch.autograd.grad(mean_log(z, depth).sum(), change)
