@@ -66,6 +66,7 @@ class StabilizerTask(Task):
                 folder, self.model, self.source, config.cache_draws, self.unreadable
             )
         self.sequences: dict[str, list[Sequence]] = {}
+        self.base_scores: dict[str, float] = {}
         described = config.objective
         self.objective = None if described is None else Objective.from_dict(described)
 
@@ -169,15 +170,20 @@ class StabilizerTask(Task):
         """
         if not self.sequences:
             self.sequences = self._find_sequences()
-        scores = {}
-        for name, sequences in self.sequences.items():
-            for kind, stabilized in (("base", False), ("dyfn", True)):
-                found = [self._score(sequence, stabilized) for sequence in sequences]
-                for protocol in ("image", "video"):
-                    scores[f"{name}_{kind}_{protocol}"] = known_mean(s[protocol] for s in found)
+        if not self.base_scores:
+            self.base_scores = self._scores("base")  # frozen: once is enough
+        scores = {**self.base_scores, **self._scores("dyfn")}
         if not np.isfinite(scores["rendered_dyfn_video"]):
             logger.warning("no depth is known in the validation clips: nothing to score")
         return {**scores, "score": scores["rendered_dyfn_video"]}
+
+    def _scores(self, kind: str) -> dict[str, float]:
+        scores = {}
+        for name, sequences in self.sequences.items():
+            found = [self._score(sequence, kind == "dyfn") for sequence in sequences]
+            for protocol in ("image", "video"):
+                scores[f"{name}_{kind}_{protocol}"] = known_mean(s[protocol] for s in found)
+        return scores
 
     def _score(self, sequence: Sequence, stabilized: bool) -> dict[str, float]:
         state: StreamState | None = None

@@ -128,3 +128,23 @@ def test_summaries_of_another_recurrence_are_refused(place: Path, tmp_path: Path
     task(place, tmp_path)
     with pytest.raises(ConfigError, match="recurrence"):
         task(place, tmp_path, "stabilizer.pool=1")
+
+
+def test_validation_scores_the_frozen_base_once(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = task(place, tmp_path)
+    assert made.model.stabilizer is not None
+    decoded: list[int] = []
+    decode = ScaleTask._decode
+    monkeypatch.setattr(
+        ScaleTask, "_decode", lambda self, *given: decoded.append(1) or decode(self, *given)
+    )
+    with torch.no_grad():
+        first, frames = made.validate(), len(decoded)
+        made.model.stabilizer.gamma_head.weight.normal_(std=0.5)  # type: ignore[union-attr]
+        second = made.validate()
+    assert len(decoded) == frames + frames // 2
+    assert second["rendered_base_video"] == first["rendered_base_video"]
+    assert first["rendered_dyfn_video"] == first["rendered_base_video"]  # untrained
+    assert second["rendered_dyfn_video"] != first["rendered_dyfn_video"]
