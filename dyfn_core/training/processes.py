@@ -25,9 +25,8 @@ if TYPE_CHECKING:
 Batch = TypeVar("Batch")
 Loss = Callable[[Any], tuple[Tensor, dict[str, float]]]
 PART_STRIDE = 2**40  # between the random seeds of the parts of one step
-PATIENCE = timedelta(
-    hours=3
-)  # others wait while one process fills its share of a cache or validates
+# Others wait so long while one process makes its share of a cache, or validates.
+PATIENCE = timedelta(hours=3)
 
 
 class LossModule(nn.Module):
@@ -160,7 +159,9 @@ def own_place() -> tuple[int, int]:
 def wait_for_every_process() -> None:
     """Until every process is here; at once when there is one."""
     if own_place()[1] > 1:
-        torch.distributed.barrier()
+        from accelerate import PartialState
+
+        PartialState().wait_for_everyone()
 
 
 def share_of(total: int, parts: int, name: str) -> int:

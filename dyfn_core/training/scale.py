@@ -110,8 +110,6 @@ class ScaleTask(StabilizerTask):
 
     def picture(self, batch: SummaryClips) -> np.ndarray:  # type: ignore[override]
         """The frames of a validation clip: true depth, base and DyFN."""
-        if not self.sequences:
-            self.sequences = self._find_sequences()
         sequence = self.sequences["rendered"][0]
         return super().picture(_as_clips(sequence))
 

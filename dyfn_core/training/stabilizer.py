@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,6 @@ class StabilizerTask(Task):
             self.cache = LatentCache(
                 folder, self.model, self.source, config.cache_draws, self.unreadable
             )
-        self.sequences: dict[str, list[Sequence]] = {}
-        self.base_scores: dict[str, float] = {}
         described = config.objective
         self.objective = None if described is None else Objective.from_dict(described)
 
@@ -168,10 +167,6 @@ class StabilizerTask(Task):
 
         NaN where no validation clip has a known depth.
         """
-        if not self.sequences:
-            self.sequences = self._find_sequences()
-        if not self.base_scores:
-            self.base_scores = self._scores("base")  # frozen: once is enough
         scores = {**self.base_scores, **self._scores("dyfn")}
         if not np.isfinite(scores["rendered_dyfn_video"]):
             logger.warning("no depth is known in the validation clips: nothing to score")
@@ -198,7 +193,14 @@ class StabilizerTask(Task):
         true = [depth.float().numpy() for depth in sequence.depth]
         return sequence_scores(predicted, true, self.model.quantity)
 
-    def _find_sequences(self) -> dict[str, list[Sequence]]:
+    @cached_property
+    def base_scores(self) -> dict[str, float]:
+        """Of the base alone, which is frozen."""
+        return self._scores("base")
+
+    @cached_property
+    def sequences(self) -> dict[str, list[Sequence]]:
+        """What is validated on, encoded."""
         found = {"rendered": self._rendered_sequences()}
         if self.config.validation_rgbd is not None:
             found["recorded"] = [self._recorded_sequence()]
