@@ -43,10 +43,10 @@ setup(
     license="Apache-2.0",
     maintainer="The dyfn_ros maintainers",
     maintainer_email="maintainers@dyfn-ros.invalid",
-    packages=find_packages(include=["dyfn_core*", "dyfn_ros*"]),
+    packages=find_packages(include=["dyfn_core*", "dyfn_ros*", "dyfn_worlds*"]),
     package_data={
-        "dyfn_core": ["weights/*", "training/*.yaml", "evaluation/*.json"],
-        "dyfn_ros": ["fastdds_images.xml"],
+        "dyfn_core": ["weights/*", "training/*.yaml", "evaluation/benchmarks/*.json"],
+        "dyfn_ros": ["node/fastdds_images.xml"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -88,15 +88,15 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "stream_depth = dyfn_ros.stream_depth:main",
-            "dyfn-replay = dyfn_ros.replay:main",
-            "dyfn-record = dyfn_ros.make_recording:main",
-            "dyfn-demo = dyfn_ros.demo:main",
+            "stream_depth = dyfn_ros.node.main:main",
+            "dyfn-replay = dyfn_ros.replay.cli:main",
+            "dyfn-record = dyfn_ros.record.cli:main",
+            "dyfn-demo = dyfn_ros.demo.cli:main",
             "dyfn-train = dyfn_core.cli.train:main",
             "dyfn-eval = dyfn_core.cli.eval:main",
-            "dyfn-worlds = dyfn_core.cli.worlds:main",
+            "dyfn-worlds = dyfn_worlds.cli:main",
         ],
-        "dyfn_core.data_kinds": ["recording = dyfn_ros.training_data:RECORDING"],
+        "dyfn_core.data_kinds": ["recording = dyfn_ros.recordings.training_data:RECORDING"],
     },
     zip_safe=False,
 )

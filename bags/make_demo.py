@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.worlds.furniture import Showroom
-from dyfn_core.data.worlds.photographer import Photographer
-from dyfn_core.data.worlds.renderer import Renderer
-from dyfn_core.data.worlds.rooms import furnished_room
-from dyfn_core.data.worlds.shards import View
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.render.renderer import Renderer
+from dyfn_worlds.rooms.furniture import Showroom
+from dyfn_worlds.rooms.rooms import furnished_room
+from dyfn_worlds.shards import View
 
 LIBRARY = "BlendSwap-CC-0.sh3f"
 SIZE = (240, 320)

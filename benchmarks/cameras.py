@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.node_process import NodeProcess
+from dyfn_ros.demo.node_process import NodeProcess
+from dyfn_ros.node.environment import prepare_environment
 
 PATIENCE = 180.0
 

@@ -21,7 +21,7 @@ import torch
 
 from dyfn_core import DepthStream, load_model
 from dyfn_core.geometry.edges import flying_pixels
-from dyfn_ros.recordings import RecordedFrame, open_recording
+from dyfn_ros.recordings.open import RecordedFrame, open_recording
 
 
 def ranks(values: np.ndarray) -> np.ndarray:

@@ -23,10 +23,10 @@ import numpy as np
 import torch
 
 from dyfn_core import DepthStream, load_model
-from dyfn_core.models import exact
+from dyfn_core.models import deterministic as exact
 from dyfn_core.models.base import GeometryModel
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.recordings import open_recording
+from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.recordings.open import open_recording
 
 SIZES = ((320, 240), (640, 480))
 

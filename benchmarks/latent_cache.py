@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from dyfn_core.training.config import StabilizerRunConfig, read_config
-from dyfn_core.training.stabilizer import StabilizerTask
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
 
 
 class Way:

@@ -32,7 +32,7 @@ from dyfn_core.metric.calibration import CalibrationOptions
 from dyfn_core.metric.references import PointReference
 from dyfn_core.metric.scale import MetricScale, ScaleOptions
 from dyfn_core.models.base import GeometryModel
-from dyfn_ros.recordings import open_recording
+from dyfn_ros.recordings.open import open_recording
 
 CLIP_RATE = 5.0  # frames a second of rendered walks
 NOISE = 0.02

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
 
 LENGTHS = (1, 4)  # times --frames
 ROUND = 120  # frames in which the camera is where it was
@@ -32,7 +32,7 @@ EXTRAS = {"video": "av", "rrd": "rerun"}  # output -> module of its extra
 # The most that was ever resident, of this process alone: rusage would count its parent's too.
 CHILD = """
 import sys
-from dyfn_ros.replay import main
+from dyfn_ros.replay.run import main
 code = main(sys.argv[1:])
 status = open("/proc/self/status").read()
 print("peak_kb", next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])

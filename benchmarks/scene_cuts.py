@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dyfn_core.streaming.scene_cut import (
+from dyfn_core.stream.scene_cut import (
     SceneCutDetector,
     colour_difference,
     look_at,

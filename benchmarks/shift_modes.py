@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from dyfn_core import DepthStream, StreamState, load_model
-from dyfn_core.evaluation.protocols import SequenceScorer, to_shape
 from dyfn_core.models.base import image_to_batch
-from dyfn_core.stream import SHIFT_MODES
-from dyfn_ros.recordings import open_recording
+from dyfn_core.scoring.protocols import SequenceScorer, to_shape
+from dyfn_core.stream.depth_stream import SHIFT_MODES
+from dyfn_ros.recordings.open import open_recording
 
 
 class Row:

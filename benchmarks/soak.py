@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from cameras import Feeder
 
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.node_process import NodeProcess
+from dyfn_ros.demo.node_process import NodeProcess
+from dyfn_ros.node.environment import prepare_environment
 
 STRETCHES = 10
 PATIENCE = 5.0  # seconds without an answer

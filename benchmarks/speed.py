@@ -26,10 +26,10 @@ import torch
 from dyfn_core import DepthStream, load_model
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.moge import MoGeModel
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.node_process import NodeProcess
-from dyfn_ros.recordings import open_recording
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.demo.node_process import NodeProcess
+from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
 
 SIZES = {"320x240": (240, 320), "640x480": (480, 640)}
 BASELINE_TOKENS = 392  # of 14 x 14 pixels: 320 x 240 in the network
@@ -82,7 +82,7 @@ def node_milliseconds(name: str, frames: list[np.ndarray], folder: Path) -> list
     domain = 1 + os.getpid() % 100
     prepare_environment()
     os.environ |= {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    from dyfn_ros.live_player import LivePlayer
+    from dyfn_ros.demo.live_player import LivePlayer
 
     source = next(recording.frames())
     space = f"/dyfn_speed_{os.getpid()}"

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.worlds.actors import Moment
-from dyfn_core.data.worlds.cameras import Lens, random_view
-from dyfn_core.data.worlds.generate import RoomWorlds
-from dyfn_core.data.worlds.occlusion import shade_corners
-from dyfn_core.data.worlds.photographer import Photographer
-from dyfn_core.data.worlds.renderer import Look, Renderer
-from dyfn_core.data.worlds.staging import stand
+from dyfn_worlds.camera.cameras import Lens, random_view
+from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.camera.staging import stand
+from dyfn_worlds.generate import RoomWorlds
+from dyfn_worlds.render.occlusion import shade_corners
+from dyfn_worlds.render.renderer import Look, Renderer
+from dyfn_worlds.scene.actors import Moment
 
 VIEWS = 12
 

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from dyfn_core.prediction import Frame as Frame
     from dyfn_core.prediction import Prediction as Prediction
     from dyfn_core.prediction import StreamState as StreamState
-    from dyfn_core.stream import DepthStream as DepthStream
+    from dyfn_core.stream.depth_stream import DepthStream as DepthStream
 
 _HOMES = {
     "load_model": "dyfn_core.models",
@@ -16,7 +16,7 @@ _HOMES = {
     "Frame": "dyfn_core.prediction",
     "Prediction": "dyfn_core.prediction",
     "StreamState": "dyfn_core.prediction",
-    "DepthStream": "dyfn_core.stream",
+    "DepthStream": "dyfn_core.stream.depth_stream",
 }
 
 __all__ = ["DepthStream", "Frame", "Prediction", "StreamState", "load_model", "save_model"]

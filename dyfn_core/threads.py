@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 # The same for the node and for dyfn-replay, whatever the machine has. The bundled models do not
-# depend on it (dyfn_core.models.exact); a model made of torch's own layers may.
+# depend on it (dyfn_core.models.deterministic); a model made of torch's own layers may.
 THREADS = 2
 
 

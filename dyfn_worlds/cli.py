@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dyfn_core.data.worlds.generate import Job, MapWorlds, RoomWorlds, render
+from dyfn_worlds.generate import Job, MapWorlds, RoomWorlds, render
 
 
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.worlds import vary as variation
-from dyfn_core.data.worlds.casting import Cast
-from dyfn_core.data.worlds.furniture import Showroom
-from dyfn_core.data.worlds.palette import Palette
-from dyfn_core.data.worlds.photographer import Photographer
-from dyfn_core.data.worlds.quake import GameFiles, MapError, load_map
-from dyfn_core.data.worlds.renderer import Renderer
-from dyfn_core.data.worlds.rooms import furnished_room
-from dyfn_core.data.worlds.scene import Scene
-from dyfn_core.data.worlds.shards import existing_shards, write_shard
+from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.maps.casting import Cast
+from dyfn_worlds.maps.quake import GameFiles, MapError, load_map
+from dyfn_worlds.render.renderer import Renderer
+from dyfn_worlds.rooms.furniture import Showroom
+from dyfn_worlds.rooms.rooms import furnished_room
+from dyfn_worlds.scene import vary as variation
+from dyfn_worlds.scene.palette import Palette
+from dyfn_worlds.scene.scene import Scene
+from dyfn_worlds.shards import existing_shards, write_shard
 
 HELD_OUT_MAPS = frozenset(
     {"aggressor", "oa_bases3plus3", "oacmpdm10", "oa_dm4", "czest1tourney", "pul1ctf"}

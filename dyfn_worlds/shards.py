@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.data.worlds.renderer import Camera
+from dyfn_worlds.render.renderer import Camera
 
 DEPTH_INVALID = 0
 DEPTH_INFINITE = 65535

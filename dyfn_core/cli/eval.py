@@ -17,11 +17,16 @@ from typing import Any
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval_arguments import add_benchmark, add_model, add_predictions
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmark_pictures import BenchmarkPictures
-from dyfn_core.evaluation.benchmark_report import write_benchmark_report
-from dyfn_core.evaluation.benchmark_run import Scoring, evaluate
-from dyfn_core.evaluation.benchmark_table import write_json, write_results
-from dyfn_core.evaluation.benchmarks import (
+from dyfn_core.evaluation.benchmarks.long_sequence import (
+    LENGTHS,
+    length_table,
+    long_sequences,
+    write_lengths,
+)
+from dyfn_core.evaluation.benchmarks.model_method import ModelMethod
+from dyfn_core.evaluation.benchmarks.pictures import BenchmarkPictures
+from dyfn_core.evaluation.benchmarks.predictions import ArrayMethod, Method, PredictionFolder
+from dyfn_core.evaluation.benchmarks.registry import (
     BENCHMARKS,
     Benchmark,
     Opened,
@@ -30,17 +35,12 @@ from dyfn_core.evaluation.benchmarks import (
     find_layout,
     open_benchmark,
 )
-from dyfn_core.evaluation.long_sequence import (
-    LENGTHS,
-    length_table,
-    long_sequences,
-    write_lengths,
-)
-from dyfn_core.evaluation.model_method import ModelMethod
-from dyfn_core.evaluation.predictions import ArrayMethod, Method, PredictionFolder
-from dyfn_core.evaluation.protocols import ALL_PIXELS
-from dyfn_core.evaluation.report import text_table
+from dyfn_core.evaluation.benchmarks.report import write_benchmark_report
+from dyfn_core.evaluation.benchmarks.run import Scoring, evaluate
+from dyfn_core.evaluation.benchmarks.table import write_json, write_results
+from dyfn_core.evaluation.report.html import text_table
 from dyfn_core.models.checkpoints import load_model
+from dyfn_core.scoring.protocols import ALL_PIXELS
 
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
 

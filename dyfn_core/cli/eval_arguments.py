@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from dyfn_core.evaluation.benchmarks import AUTO, LAYOUTS
-from dyfn_core.evaluation.predictions import QUANTITIES
-from dyfn_core.evaluation.protocols import FITS, L1
+from dyfn_core.evaluation.benchmarks.predictions import QUANTITIES
+from dyfn_core.evaluation.benchmarks.registry import AUTO, LAYOUTS
+from dyfn_core.scoring.protocols import FITS, L1
 
 
 def add_benchmark(command: argparse.ArgumentParser) -> None:

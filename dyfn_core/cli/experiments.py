@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.evaluation.controls import ema_control, frozen_control
 from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
 from dyfn_core.experiments.report import (
@@ -25,8 +24,9 @@ from dyfn_core.experiments.runner import Plan, Runner, encode_all
 from dyfn_core.experiments.scenes import Scene, predictions, scores_by_length
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.stabilizer import Stabilizer
-from dyfn_core.training.trainer import MODEL_FILE
+from dyfn_core.models.controls import ema_control, frozen_control
+from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.training.loop.trainer import MODEL_FILE
 
 LENGTHS = (100, 200, 300, 400, 500)
 GRID_FRAMES = 24

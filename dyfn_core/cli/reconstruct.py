@@ -12,11 +12,10 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
-from dyfn_core.evaluation.cloud_error import write_ply
-from dyfn_core.evaluation.matching import build_matcher
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.reconstruction import OFFSETS, ReconstructionOptions
-from dyfn_core.evaluation.reconstruction_runs import (
+from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
+from dyfn_core.evaluation.reconstruction.matching import build_matcher
+from dyfn_core.evaluation.reconstruction.poses import OFFSETS, ReconstructionOptions
+from dyfn_core.evaluation.reconstruction.runs import (
     TABLE_NOTE,
     RunResult,
     SequenceRuns,
@@ -26,7 +25,7 @@ from dyfn_core.evaluation.reconstruction_runs import (
     reconstruct_sequence,
     reconstruction_table,
 )
-from dyfn_core.evaluation.report import (
+from dyfn_core.evaluation.report.html import (
     Part,
     Picture,
     Section,
@@ -35,6 +34,7 @@ from dyfn_core.evaluation.report import (
     text_table,
     write_report,
 )
+from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.models.checkpoints import load_model
 
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3

@@ -19,7 +19,7 @@ from dyfn_core.evaluation.empirical_study import (
     statistics_grid,
     write_grid,
 )
-from dyfn_core.evaluation.report import text_table
+from dyfn_core.evaluation.report.html import text_table
 from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.checkpoints import load_model
 

@@ -15,10 +15,9 @@ import yaml
 from dyfn_core.cli import experiments
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
-from dyfn_core.evaluation.controls import VariantScore, score_variants, variant_table
+from dyfn_core.evaluation.variants import VariantScore, score_variants, variant_table
 from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.training.average import average
-from dyfn_core.training.base import BaseTask
 from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
@@ -27,12 +26,8 @@ from dyfn_core.training.config import (
     StabilizerRunConfig,
     read_config,
 )
-from dyfn_core.training.processes import Processes
-from dyfn_core.training.scale import ScaleTask
-from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
-from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.task import Task
-from dyfn_core.training.trainer import (
+from dyfn_core.training.loop.processes import Processes
+from dyfn_core.training.loop.trainer import (
     BEST_FILE,
     MODEL_FILE,
     InterruptedRunError,
@@ -40,6 +35,11 @@ from dyfn_core.training.trainer import (
     TrainingError,
     check_folder,
 )
+from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
+from dyfn_core.training.tasks.base import BaseTask
+from dyfn_core.training.tasks.dyfn_linearized import ScaleTask
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.task import Task
 
 FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
 

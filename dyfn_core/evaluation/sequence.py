@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.pictures import FrameStrip, curves
-from dyfn_core.evaluation.protocols import (
+from dyfn_core.evaluation.report.html import Cell, Table
+from dyfn_core.evaluation.report.pictures import FrameStrip, curves
+from dyfn_core.evaluation.report.worst_frames import WorstFrames
+from dyfn_core.prediction import DEPTH
+from dyfn_core.scoring.protocols import (
     ControlledScorer,
     FrameScore,
     SequenceScore,
@@ -18,9 +21,6 @@ from dyfn_core.evaluation.protocols import (
     spread,
     to_shape,
 )
-from dyfn_core.evaluation.report import Cell, Table
-from dyfn_core.evaluation.worst_frames import WorstFrames
-from dyfn_core.prediction import DEPTH
 
 COLUMNS = (
     "frame",

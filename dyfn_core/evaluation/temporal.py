@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from dyfn_core.data.datasets.axes import inverse
-from dyfn_core.evaluation.protocols import MIN_DEPTH, MIN_PIXELS, align_depth, sample_grid, to_shape
 from dyfn_core.prediction import DEPTH
+from dyfn_core.scoring.protocols import MIN_DEPTH, MIN_PIXELS, align_depth, sample_grid, to_shape
 
 SAME_DEPTH = 0.01  # relative change of the truth at a pixel up to which the scene stood still there
 SAME_PLACE = 1.0  # pixels that a static point may move by, where poses are known

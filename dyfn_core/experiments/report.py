@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.evaluation.controls import VariantScore, gap_closed
 from dyfn_core.evaluation.empirical_study import StatisticsGrid, grid_ranges
-from dyfn_core.evaluation.report import format_cell
+from dyfn_core.evaluation.report.html import format_cell
+from dyfn_core.evaluation.variants import VariantScore, gap_closed
 from dyfn_core.experiments.declared import Experiment
 from dyfn_core.experiments.runner import ArmScores
 from dyfn_core.experiments.scenes import BASE_ROWS

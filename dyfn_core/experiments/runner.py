@@ -12,19 +12,19 @@ from typing import Any
 from dyfn_core.data.clips import find_sequences
 from dyfn_core.data.frames import FrameSequence
 from dyfn_core.data.sequences import folder_frames
-from dyfn_core.evaluation.controls import VariantScore
+from dyfn_core.evaluation.variants import VariantScore
 from dyfn_core.experiments.declared import Arm
 from dyfn_core.experiments.scenes import Scene, encode_scene, score_controls, score_stabilizer
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.stabilizer import StabilizerConfig
-from dyfn_core.training.base import clip_source
-from dyfn_core.training.checkpoint import has_state
+from dyfn_core.models.dyfn import StabilizerConfig
 from dyfn_core.training.config import StabilizerRunConfig, read_config
-from dyfn_core.training.processes import Processes
-from dyfn_core.training.run_folder import RESULTS_FILE
-from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.trainer import MODEL_FILE, Trainer, TrainingError
+from dyfn_core.training.loop.checkpoint import has_state
+from dyfn_core.training.loop.processes import Processes
+from dyfn_core.training.loop.run_folder import RESULTS_FILE
+from dyfn_core.training.loop.trainer import MODEL_FILE, Trainer, TrainingError
+from dyfn_core.training.tasks.base import clip_source
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
 
 HELD_OUT = "held-out clips"
 CACHE_SEED = 0  # one cache serves the runs of all seeds

@@ -8,16 +8,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from dyfn_core.evaluation.controls import (
-    VariantScore,
-    ema_control,
-    frozen_control,
-    stabilized_by,
-)
-from dyfn_core.evaluation.protocols import CONTROLS, SequenceScorer, to_shape
+from dyfn_core.evaluation.variants import VariantScore
 from dyfn_core.models.base import GeometryModel, Latent
-from dyfn_core.models.stabilizer import Stabilizer
+from dyfn_core.models.controls import ema_control, frozen_control, stabilized_by
+from dyfn_core.models.dyfn import Stabilizer
 from dyfn_core.prediction import DEPTH, StreamState
+from dyfn_core.scoring.protocols import CONTROLS, SequenceScorer, to_shape
 
 METRICS = tuple(field.name for field in fields(VariantScore))
 BASE_ROWS = ("ramp", "constant", "base", "ema", "frozen")

@@ -307,3 +307,8 @@ def _illinois(
             side = 1
         last = middle
     return middle
+
+
+def valid_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """H x W bool: where depth is finite, in front of the camera, and the model believes in it."""
+    return mask & np.isfinite(depth) & (depth > 0)

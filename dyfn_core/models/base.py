@@ -16,7 +16,7 @@ from dyfn_core.geometry.camera import (
     intrinsics_from_focal,
     recover_focal_shift,
 )
-from dyfn_core.models.stabilizer import Stabilizer
+from dyfn_core.models.dyfn import Stabilizer
 from dyfn_core.prediction import DEPTH, DISPARITY, Prediction, StreamState
 
 NOMINAL_FOV = 60.0  # degrees, of an unknown camera whose model gives no point map

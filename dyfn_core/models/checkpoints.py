@@ -27,9 +27,9 @@ from torch import Tensor
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.depth_anything import DepthAnythingModel, official_encoder
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 logger = logging.getLogger(__name__)
 

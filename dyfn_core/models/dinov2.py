@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.exact import Conv2d, Linear
+from dyfn_core.models.deterministic import Conv2d, Linear
 
 PATCH = 14
 TRAINED_GRID = 37

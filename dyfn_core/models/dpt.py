@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.exact import Conv2d, resize
+from dyfn_core.models.deterministic import Conv2d, resize
 
 OUTPUT_CHANNELS = 32
 

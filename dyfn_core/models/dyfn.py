@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.exact import Conv2d, Linear
+from dyfn_core.models.deterministic import Conv2d, Linear
 from dyfn_core.prediction import StreamState
 
 EPSILON = 1e-5

@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.exact import convolve
+from dyfn_core.models.deterministic import convolve
 
 BATCH_NORM_EPS = 1e-3
 IMAGE_MEAN = 127 / 255

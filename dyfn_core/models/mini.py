@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.deterministic import Conv2d, GroupNorm, Linear, resize
 from dyfn_core.models.efficientnet import (
     FEATURE_CHANNELS,
     IMAGE_MEAN,
@@ -23,7 +24,6 @@ from dyfn_core.models.efficientnet import (
     EfficientNetLite0,
     imagenet_weights,
 )
-from dyfn_core.models.exact import Conv2d, GroupNorm, Linear, resize
 
 CELL = 16  # pixels along the side of one token of the budget
 MULTIPLE = 32  # network sizes are multiples of the encoder's largest stride

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.deterministic import Conv2d, GroupNorm, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
-from dyfn_core.models.exact import Conv2d, GroupNorm, resize
 from dyfn_core.prediction import StreamState
 
 REMAPS = ("linear", "sinh", "exp", "sinh_exp")

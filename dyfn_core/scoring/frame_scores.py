@@ -10,7 +10,7 @@ from typing import overload
 
 import numpy as np
 
-from dyfn_core.evaluation.metrics import METRICS, mean_metrics
+from dyfn_core.scoring.metrics import METRICS, mean_metrics
 
 
 @dataclass(frozen=True)

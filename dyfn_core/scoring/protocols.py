@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.evaluation.frame_scores import FrameScore, FrameScores, MetricRows
-from dyfn_core.evaluation.metrics import depth_metrics
-from dyfn_core.evaluation.samples import Samples
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.prediction import DEPTH, DISPARITY
+from dyfn_core.scoring.frame_scores import FrameScore, FrameScores, MetricRows
+from dyfn_core.scoring.metrics import depth_metrics
+from dyfn_core.scoring.samples import Samples
 
 FARTHEST = 1e4  # metres: depth where aligned disparity is not positive, unless capped below
 MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is clipped to it

@@ -1,1 +1,1 @@
-"""What a camera stream needs around DepthStream: scene cuts, and state on disk."""
+"""One stream: frames in one at a time, geometry that keeps one scale out."""

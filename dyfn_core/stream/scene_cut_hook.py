@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from dyfn_ros.camera_stream import StreamFrame, StreamHook
+from dyfn_core.stream.session import StreamFrame, StreamHook
 
 if TYPE_CHECKING:
-    from dyfn_core.streaming.scene_cut import CutState
+    from dyfn_core.stream.scene_cut import CutState
 
 SCENE_CUT = "scene cut"
 
@@ -17,7 +17,7 @@ class SceneCutHook(StreamHook):
     """threshold: asked for at each frame; 0 switches it off."""
 
     def __init__(self, threshold: Callable[[], float]) -> None:
-        from dyfn_core.streaming.scene_cut import SceneCutDetector
+        from dyfn_core.stream.scene_cut import SceneCutDetector
 
         self._threshold = threshold
         self._detector = SceneCutDetector()

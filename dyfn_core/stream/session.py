@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dyfn_ros.messages import valid_depth
+from dyfn_core.geometry.camera import pixel_intrinsics, valid_depth
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
     from dyfn_core.prediction import Prediction
-    from dyfn_core.stream import DepthStream
+    from dyfn_core.stream.depth_stream import DepthStream
 
 REQUESTED = "reset service"
 TIME_JUMP = "ROS time jumped"
@@ -168,7 +168,7 @@ StreamMaker = Callable[[StreamKey], "DepthStream"]
 
 def stream_maker(model: GeometryModel) -> StreamMaker:
     """The one way in which streams are made, live and offline."""
-    from dyfn_core.stream import DepthStream
+    from dyfn_core.stream.depth_stream import DepthStream
 
     def make(key: StreamKey) -> DepthStream:
         matrix = key.camera_matrix
@@ -264,15 +264,9 @@ def _geometry(prediction: Prediction, frame: StreamFrame, reset: str | None) -> 
         valid &= frame.visible
     matrix = frame.camera_matrix
     if matrix is None:
-        matrix = pixel_matrix(prediction.intrinsics.cpu().numpy(), *depth.shape)
+        matrix = pixel_intrinsics(
+            prediction.intrinsics.cpu().numpy(), (depth.shape[0], depth.shape[1])
+        )
     disparity = None if prediction.disparity is None else prediction.disparity.cpu().numpy()
     points = prediction.points.cpu().numpy()
     return Geometry(points, depth, valid, matrix, reset, disparity=disparity)
-
-
-def pixel_matrix(intrinsics: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Normalised intrinsics (x = (u + 0.5) / W) -> 3 x 3 float64 in pixels."""
-    scale = np.array([[width], [height], [1.0]])
-    matrix = np.asarray(intrinsics, np.float64) * scale
-    matrix[:2, 2] -= 0.5
-    return matrix

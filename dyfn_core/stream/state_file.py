@@ -23,9 +23,9 @@ from dyfn_core.metric.references import Evidence
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import full_config
 from dyfn_core.prediction import StreamState
-from dyfn_core.stream import DepthStream, StreamMemory, Track
-from dyfn_core.streaming.plain_values import PlainError, from_plain, to_plain
-from dyfn_core.streaming.scene_cut import CutState, Look
+from dyfn_core.stream.depth_stream import DepthStream, StreamMemory, Track
+from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
+from dyfn_core.stream.scene_cut import CutState, Look
 
 FORMAT = "dyfn-stream 1"
 

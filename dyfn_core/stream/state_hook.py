@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dyfn_ros.camera_stream import (
+from dyfn_core.stream.session import (
     CameraStream,
     Geometry,
     StreamFrame,
@@ -20,9 +20,9 @@ from dyfn_ros.camera_stream import (
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
-    from dyfn_core.streaming.state_file import SavedStream
-    from dyfn_ros.metric_scale import MetricHook
-    from dyfn_ros.scene_cut import SceneCutHook
+    from dyfn_core.stream.scene_cut_hook import SceneCutHook
+    from dyfn_core.stream.state_file import SavedStream
+    from dyfn_ros.node.metric_scale import MetricHook
 
 
 class StateError(ValueError):
@@ -57,7 +57,7 @@ class StateHook(StreamHook):
     def __init__(
         self, stream: CameraStream, metric: MetricHook, cut: SceneCutHook, model: GeometryModel
     ) -> None:
-        from dyfn_core.streaming.state_file import model_fingerprint
+        from dyfn_core.stream.state_file import model_fingerprint
 
         self._stream, self._metric, self._cut = stream, metric, cut
         self._fingerprint = model_fingerprint(model)
@@ -72,7 +72,7 @@ class StateHook(StreamHook):
 
     def save(self, path: str) -> str:
         """-> what was saved. Raises StateError; an older file is then still there."""
-        from dyfn_core.streaming.state_file import save_stream
+        from dyfn_core.stream.state_file import save_stream
 
         now = self._checkpoint
         if now is None:
@@ -99,7 +99,7 @@ class StateHook(StreamHook):
         begin: called when the file is good, -> the number of the epoch that starts with it.
         Raises StateError: a damaged file, another model's, or one that does not fit the camera.
         """
-        from dyfn_core.streaming.state_file import StateFileError, load_stream, restore
+        from dyfn_core.stream.state_file import StateFileError, load_stream, restore
 
         try:
             saved = load_stream(_checked(path), self._fingerprint)

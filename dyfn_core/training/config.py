@@ -22,8 +22,8 @@ from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
 from dyfn_core.losses.objective import Objective
+from dyfn_core.models.dyfn import StabilizerConfig
 from dyfn_core.models.mini import MiniConfig
-from dyfn_core.models.stabilizer import StabilizerConfig
 from dyfn_core.training.config_errors import check_fields, describe
 
 Settings = TypeVar("Settings", bound="RunConfig")

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 import yaml
 
-from dyfn_core.training.checkpoint import STATE_FILE
-from dyfn_core.training.run_folder import CONFIG_FILE, LOG_FILE, read_log
+from dyfn_core.training.loop.checkpoint import STATE_FILE
+from dyfn_core.training.loop.run_folder import CONFIG_FILE, LOG_FILE, read_log
 
 BOOKKEEPING = ("step", "seconds", "images", "group")
 

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.pictures import draw_cloud, encode_picture
-from dyfn_core.evaluation.report import Section, Text, text_table, write_report
+from dyfn_core.evaluation.report.html import Section, Text, text_table, write_report
+from dyfn_core.evaluation.report.pictures import draw_cloud, encode_picture
+from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, score_table
-from dyfn_core.evaluation.sequence_report import sequence_sections
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.node_process import NODE_COMMAND, LiveError, NodeProcess
-from dyfn_ros.recordings import RecordedFrame, Recording, RecordingError, open_recording
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE
+from dyfn_ros.demo.node_process import NODE_COMMAND, LiveError, NodeProcess
+from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.recordings.open import RecordedFrame, Recording, RecordingError, open_recording
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 
 if TYPE_CHECKING:
-    from dyfn_ros.live_player import LivePlayer
+    from dyfn_ros.demo.live_player import LivePlayer
 
 OK, FAILED, UNUSABLE = 0, 1, 2
 RUNS = {"with DyFN": True, "without (base model)": False}
@@ -65,7 +65,7 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
 def default_recording() -> Path:
     """bags/demo here, else in the source tree."""
     here = Path("bags/demo")
-    return here if here.exists() else Path(__file__).resolve().parents[1] / here
+    return here if here.exists() else Path(__file__).resolve().parents[2] / here
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, R
     prepare_environment()
     os.environ["ROS_DOMAIN_ID"] = str(options.domain)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    from dyfn_ros.live_player import LivePlayer
+    from dyfn_ros.demo.live_player import LivePlayer
 
     parameters = {
         "model": options.model,

@@ -19,10 +19,11 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_srvs.srv import Trigger
 
-from dyfn_ros.messages import cloud_points, decode_depth
-from dyfn_ros.node_process import LiveError, NodeProcess
-from dyfn_ros.recordings import RecordedFrame
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, TYPES
+from dyfn_ros.demo.node_process import LiveError, NodeProcess
+from dyfn_ros.messages.clouds import cloud_points
+from dyfn_ros.messages.images import decode_depth
+from dyfn_ros.recordings.open import RecordedFrame
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, TYPES
 
 OUTPUTS = {"depth/image": Image, "depth/camera_info": CameraInfo, "points": PointCloud2}
 START_PATIENCE = 180.0  # seconds for imports and loading the model, on a busy machine

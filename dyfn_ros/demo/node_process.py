@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-NODE_COMMAND = (sys.executable, "-m", "dyfn_ros.stream_depth")
+NODE_COMMAND = (sys.executable, "-m", "dyfn_ros.node.main")
 TAIL_LINES = 15
 PATIENCE = (10.0, 5.0)  # seconds after SIGINT, after SIGTERM; then SIGKILL
 

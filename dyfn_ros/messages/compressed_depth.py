@@ -8,9 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.encodings import MessageError
-from dyfn_ros.messages import depth_fields
-from dyfn_ros.picture_size import PNG, check_picture_size
+from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.images import depth_fields
+from dyfn_ros.messages.picture_size import PNG, check_picture_size
 
 _HEADER = struct.Struct("<iff")  # compressedDepth: format, then A and B of z = A / (value - B)
 

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
-from dyfn_ros.picture_size import JPEG, PNG, check_picture_size
+from dyfn_ros.messages.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
+from dyfn_ros.messages.picture_size import JPEG, PNG, check_picture_size
 
 _LAYOUT = re.compile(
     r"^\s*(?:(?P<encoding>\w+)\s*;\s*)?(?P<codec>\w+)(?:\s+compressed\s*(?P<order>\w*))?"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from dyfn_ros.encodings import MessageError
+from dyfn_ros.messages.encodings import MessageError
 
 JPEG = b"\xff\xd8\xff"
 PNG = b"\x89PNG\r\n\x1a\n"

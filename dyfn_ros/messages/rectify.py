@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.messages import Calibration, MessageError, decode_camera_info
+from dyfn_ros.messages.camera_info import Calibration, decode_camera_info
+from dyfn_ros.messages.images import MessageError
 
 
 @dataclass(frozen=True)

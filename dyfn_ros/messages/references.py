@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dyfn_ros import messages
-from dyfn_ros.messages import MessageError
+from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.images import MessageError
 
 if TYPE_CHECKING:
     from dyfn_core.metric.references import Reference

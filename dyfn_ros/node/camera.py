@@ -12,8 +12,8 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dyfn_ros.calibration import CalibrationRules, Calibrator, View
-from dyfn_ros.camera_stream import (
+from dyfn_core.stream.scene_cut_hook import SceneCutHook
+from dyfn_core.stream.session import (
     REQUESTED,
     CameraStream,
     Geometry,
@@ -22,15 +22,15 @@ from dyfn_ros.camera_stream import (
     TimeRules,
     stream_maker,
 )
-from dyfn_ros.compressed_image import decode_compressed
-from dyfn_ros.messages import MessageError, decode_image
-from dyfn_ros.metric_scale import MetricHook, ScalePorts
-from dyfn_ros.outputs import Outputs
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.ports import Ports
-from dyfn_ros.scene_cut import SceneCutHook
-from dyfn_ros.state_file import StateError, StateHook, path_for
-from dyfn_ros.statistics import FrameStatistics
+from dyfn_core.stream.state_hook import StateError, StateHook, path_for
+from dyfn_ros.messages.compressed_image import decode_compressed
+from dyfn_ros.messages.images import MessageError, decode_image
+from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View
+from dyfn_ros.node.metric_scale import MetricHook, ScalePorts
+from dyfn_ros.node.outputs import Outputs
+from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.statistics import FrameStatistics
+from dyfn_ros.node.topics import Ports
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel

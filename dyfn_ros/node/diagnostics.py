@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from dyfn_ros.camera import Camera
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.statistics import Snapshot
+from dyfn_ros.node.camera import Camera
+from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.statistics import Snapshot
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 

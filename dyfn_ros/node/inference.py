@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from dyfn_ros.calibration import View
-from dyfn_ros.camera import Job
-from dyfn_ros.camera_stream import StreamFrame
-from dyfn_ros.messages import MessageError
+from dyfn_core.stream.session import StreamFrame
+from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.rectify import View
+from dyfn_ros.node.camera import Job
 
 if TYPE_CHECKING:
     from dyfn_core.prediction import Prediction
-    from dyfn_core.stream import DepthStream
+    from dyfn_core.stream.depth_stream import DepthStream
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def _run_group(group: list[_Begun]) -> None:
 
 def _predict(group: list[_Begun]) -> list[Prediction]:
     """Raises what the network raises; the streams are then as they were."""
-    from dyfn_core.stream import push_together
+    from dyfn_core.stream.depth_stream import push_together
 
     streams = [one.stream for one in group]
     memories = [stream.memory for stream in streams]

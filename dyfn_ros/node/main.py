@@ -12,9 +12,9 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import uninstall_signal_handlers
 
-from dyfn_ros.depth_node import ModelLoader, StreamDepthNode, load_bundled
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.parameters import usage
+from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.node.node import ModelLoader, StreamDepthNode, load_bundled
+from dyfn_ros.node.parameters.declare import usage
 
 
 def _make(args: Sequence[str] | None, load: ModelLoader) -> StreamDepthNode | None:

@@ -14,11 +14,11 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64
 
-from dyfn_ros.camera_stream import BACKWARDS, TIME_JUMP, Geometry, StreamFrame, StreamHook
-from dyfn_ros.messages import MessageError
-from dyfn_ros.metric_messages import parse_transform, reference_decoder
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.ports import Ports
+from dyfn_core.stream.session import BACKWARDS, TIME_JUMP, Geometry, StreamFrame, StreamHook
+from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.references import parse_transform, reference_decoder
+from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.topics import Ports
 
 if TYPE_CHECKING:
     from dyfn_core.metric.calibration import Calibration

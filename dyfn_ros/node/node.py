@@ -15,16 +15,16 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
-from dyfn_ros.camera import Camera, Job
-from dyfn_ros.camera_stream import REQUESTED, TIME_JUMP
-from dyfn_ros.diagnostics import Report, node_diagnostics
-from dyfn_ros.inference import run_jobs
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.parameters import NodeParameters
-from dyfn_ros.ports import Ports
-from dyfn_ros.state_file import StateError
-from dyfn_ros.throttle import Throttle
-from dyfn_ros.worker import FrameWorker
+from dyfn_core.stream.session import REQUESTED, TIME_JUMP
+from dyfn_core.stream.state_hook import StateError
+from dyfn_ros.node.camera import Camera, Job
+from dyfn_ros.node.diagnostics import Report, node_diagnostics
+from dyfn_ros.node.inference import run_jobs
+from dyfn_ros.node.log_throttle import Throttle
+from dyfn_ros.node.parameters.declare import NodeParameters
+from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.topics import Ports
+from dyfn_ros.node.worker import FrameWorker
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel

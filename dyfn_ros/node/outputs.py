@@ -11,11 +11,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from dyfn_core.geometry.edges import flying_pixels
-from dyfn_ros import messages
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.compressed_depth import FARTHEST, encode_compressed_depth
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.ports import Ports
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.messages.camera_info import camera_info_message
+from dyfn_ros.messages.clouds import cloud_message, pack_cloud
+from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
+from dyfn_ros.messages.images import colour_message, compressed_message, depth_message
+from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.topics import Ports
 
 _OUTPUT_DEPTH = 5
 _LOSSLESS_DEPTH = 100  # a cloud of 640 x 480 is 10 MB
@@ -61,21 +63,21 @@ class Outputs:
         valid = in_range(depth, geometry.valid, settings.min_depth, settings.max_depth)
         if settings.publish_depth:
             if self._depth.get_subscription_count():
-                self._depth.publish(messages.depth_message(header, depth, valid, encoding))
+                self._depth.publish(depth_message(header, depth, valid, encoding))
             if self._packed.get_subscription_count():
                 farthest = settings.max_depth or FARTHEST
                 packed = encode_compressed_depth(depth, valid, encoding, farthest)
-                self._packed.publish(messages.compressed_message(header, *packed))
+                self._packed.publish(compressed_message(header, *packed))
             if self._info.get_subscription_count():
                 self._info.publish(_sibling_info(header, info, geometry))
         if settings.publish_colored and self._colored.get_subscription_count():
             if geometry.reset:
                 self._colours = ColourScale()
             painted = self._colours.paint(np.where(valid, depth, np.nan))
-            self._colored.publish(messages.colour_message(header, painted))
+            self._colored.publish(colour_message(header, painted))
         if settings.publish_points and self._points.get_subscription_count():
             cloud = filtered_cloud(geometry, valid, image, settings)
-            self._points.publish(messages.cloud_message(header, cloud))
+            self._points.publish(cloud_message(header, cloud))
 
     def publish_reset(self, header: Any, name: str, reason: str, counts: dict[str, int]) -> None:
         """header: of the first frame after the reset. counts: resets so far, by reason."""
@@ -96,7 +98,10 @@ class ColourScale:
 
     def paint(self, depth: np.ndarray) -> np.ndarray:
         """H x W depth, NaN invalid -> H x W x 3 uint8 RGB, see colour_depth."""
-        from dyfn_core.evaluation.pictures import colour_depth, depth_range  # imports matplotlib
+        from dyfn_core.evaluation.report.pictures import (  # imports matplotlib
+            colour_depth,
+            depth_range,
+        )
 
         sample = depth[::4, ::4]
         if np.isfinite(sample).any():
@@ -110,7 +115,7 @@ class ColourScale:
 def filtered_cloud(
     geometry: Geometry, valid: np.ndarray, image: np.ndarray, settings: Settings
 ) -> np.ndarray:
-    """The cloud that the points_... settings ask for: h x w of messages.CLOUD_DTYPE.
+    """The cloud that the points_... settings ask for: h x w of CLOUD_DTYPE.
 
     Range and edges are judged at full resolution; the stride then takes the middle pixel of each
     block.
@@ -121,7 +126,7 @@ def filtered_cloud(
     stride = settings.points_stride
     first = (min(stride, *valid.shape) - 1) // 2
     grid = (slice(first, None, stride),) * 2
-    return messages.pack_cloud(geometry.points[grid], valid[grid], image[grid])
+    return pack_cloud(geometry.points[grid], valid[grid], image[grid])
 
 
 def in_range(depth: np.ndarray, valid: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -134,7 +139,7 @@ def _sibling_info(header: Any, info: CameraInfo | None, geometry: Geometry) -> C
     """The camera_info beside the depth image: the camera's own, or what is known."""
     if info is None:
         height, width = geometry.depth.shape
-        return messages.camera_info_message(header, geometry.camera_matrix, height, width)
+        return camera_info_message(header, geometry.camera_matrix, height, width)
     sibling = copy.copy(info)
     sibling.header = header
     return sibling

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rosbags_messages import Lens
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.typestore import Lens
 
 
 @dataclass(frozen=True)

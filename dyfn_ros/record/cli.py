@@ -13,13 +13,13 @@ from typing import get_args
 
 import numpy as np
 
-from dyfn_ros.arguments import at_least_one, finite_above_zero
-from dyfn_ros.camera_yaml import read_camera_yaml
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.recording_sources import folder_frames, video_frames
-from dyfn_ros.recording_writer import STORAGES, DepthEncoding
-from dyfn_ros.rgbd_recording import ColourEncoding, RgbdFrame, write_rgbd_recording
-from dyfn_ros.rosbags_messages import Lens
+from dyfn_core.argument_types import at_least_one, finite_above_zero
+from dyfn_ros.record.camera_yaml import read_camera_yaml
+from dyfn_ros.record.sources import folder_frames, video_frames
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_writer import ColourEncoding, RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.typestore import Lens
+from dyfn_ros.recordings.writer import STORAGES, DepthEncoding
 
 ALL, UNUSABLE, PARTIAL = 0, 2, 3  # exit codes, as dyfn-replay's
 LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}

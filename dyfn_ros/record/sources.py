@@ -12,12 +12,12 @@ import numpy as np
 
 from dyfn_core.data.datasets import rgbd_folder as layouts
 from dyfn_core.data.frames import DataError, DataReport, FrameError, NumberedSequence
-from dyfn_ros.camera_stream import pixel_matrix
-from dyfn_ros.camera_yaml import CameraYaml
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rgbd_folder import is_rgbd_folder, read_rgbd_folder
-from dyfn_ros.rgbd_recording import RgbdFrame
-from dyfn_ros.rosbags_messages import Lens
+from dyfn_core.geometry.camera import pixel_intrinsics
+from dyfn_ros.record.camera_yaml import CameraYaml
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_rgbd_folder
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame
+from dyfn_ros.recordings.typestore import Lens
 
 PLAIN_RATE, SENSOR_RATE = 10.0, 30.0  # frames a second of folders without stamps
 Warn = Callable[[str], None]
@@ -52,7 +52,7 @@ def folder_frames(
             continue
         fx, fy, cx, cy = (float(value) for value in frame.intrinsics)
         normalised = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        matrix = pixel_matrix(normalised, *frame.image.shape[:2])
+        matrix = pixel_intrinsics(normalised, frame.image.shape[:2])
         stamp = (number - first) / rate if frame.stamp is None else frame.stamp
         yield RgbdFrame(frame.image, frame.depth, matrix, frame.pose, stamp)
 

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from dyfn_ros.recorded import Recorded
+from dyfn_ros.recordings.storage.base import Recorded
 
 MAX_WAITING = 32  # frames that wait for their ground truth, and depths for their frame
 

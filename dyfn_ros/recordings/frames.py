@@ -10,8 +10,8 @@ from typing import Protocol
 
 import numpy as np
 
-from dyfn_ros.recorded import Recorded
-from dyfn_ros.topics import Topics
+from dyfn_ros.recordings.storage.base import Recorded
+from dyfn_ros.recordings.topics import Topics
 
 
 @dataclass(frozen=True)

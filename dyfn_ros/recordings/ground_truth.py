@@ -7,17 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.predictions import scored_values
+from dyfn_core.evaluation.benchmarks.predictions import scored_values
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.projection import back_project, render_depth, resized_camera
 from dyfn_core.prediction import DEPTH, DISPARITY
-from dyfn_ros.calibration import View, undistort_depth
-from dyfn_ros.compressed_depth import decode_compressed_depth
-from dyfn_ros.encodings import MessageError
-from dyfn_ros.messages import Calibration, decode_camera_info, decode_depth
-from dyfn_ros.metric_messages import Transform, decode_points
-from dyfn_ros.recorded import Recorded
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, POINT_CLOUD
+from dyfn_ros.messages.camera_info import Calibration, decode_camera_info
+from dyfn_ros.messages.compressed_depth import decode_compressed_depth
+from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.images import decode_depth
+from dyfn_ros.messages.rectify import View, undistort_depth
+from dyfn_ros.messages.references import Transform, decode_points
+from dyfn_ros.recordings.storage.base import Recorded
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, POINT_CLOUD
 
 SAME = 2e-3  # of the image's width and height: intrinsics that differ by less are the same
 

@@ -7,15 +7,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.metric_messages import parse_pose
-from dyfn_ros.recorded import Recorded
-from dyfn_ros.recorded_frames import Notes, RecordedFrame, Recording
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.rgbd_folder import IMAGE_SUFFIXES, is_rgbd_folder, numbered, read_rgbd_folder
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
-from dyfn_ros.ros_recording import RosRecording
-from dyfn_ros.rosbags_messages import (
+from dyfn_ros.messages.references import parse_pose
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.frames import Notes, RecordedFrame, Recording
+from dyfn_ros.recordings.rgbd_folder import (
+    IMAGE_SUFFIXES,
+    is_rgbd_folder,
+    numbered,
+    read_rgbd_folder,
+)
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.ros import RosRecording
+from dyfn_ros.recordings.storage.base import Recorded
+from dyfn_ros.recordings.storage.open import open_storage
+from dyfn_ros.recordings.topics import Topics, choose_topics
+from dyfn_ros.recordings.topics import image_topics as list_image_topics
+from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     IMAGE,
     POINT_CLOUD,
@@ -23,9 +30,7 @@ from dyfn_ros.rosbags_messages import (
     camera_info,
     image_message,
 )
-from dyfn_ros.storage import open_storage
-from dyfn_ros.topics import Topics, choose_topics
-from dyfn_ros.topics import image_topics as list_image_topics
+from dyfn_ros.recordings.writer import RecordingWriter
 
 __all__ = [
     "FolderRecording",

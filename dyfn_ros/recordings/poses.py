@@ -11,11 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from dyfn_core.data.datasets.axes import inverse, quaternion_rotation, rigid
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rgbd_folder import is_rgbd_folder, read_poses
-from dyfn_ros.rosbags_messages import POSE, TF
-from dyfn_ros.storage import Storage, open_storage
-from dyfn_ros.topics import NONE
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_poses
+from dyfn_ros.recordings.storage.open import Storage, open_storage
+from dyfn_ros.recordings.topics import NONE
+from dyfn_ros.recordings.typestore import POSE, TF
 
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"

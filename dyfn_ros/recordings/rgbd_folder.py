@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rgbd_recording import RgbdFrame
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 

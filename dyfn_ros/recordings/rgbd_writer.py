@@ -9,9 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.recording_writer import DepthEncoding, RecordingWriter
-from dyfn_ros.rosbags_messages import Lens
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.typestore import Lens
+from dyfn_ros.recordings.writer import DepthEncoding, RecordingWriter
 
 ColourEncoding = Literal["jpeg", "png", "raw"]
 

@@ -10,18 +10,18 @@ from typing import Any, Literal
 import numpy as np
 
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.calibration import CalibrationRules, Calibrator, View
-from dyfn_ros.compressed_image import decode_compressed
-from dyfn_ros.depth_matching import Stamped, match_depth
-from dyfn_ros.encodings import MessageError
-from dyfn_ros.ground_truth import GroundTruth
-from dyfn_ros.messages import decode_image
-from dyfn_ros.metric_messages import Transform
-from dyfn_ros.recorded import Recorded, Storage
-from dyfn_ros.recorded_frames import Notes, RecordedFrame
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE
-from dyfn_ros.topics import Topics
+from dyfn_ros.messages.compressed_image import decode_compressed
+from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.images import decode_image
+from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View
+from dyfn_ros.messages.references import Transform
+from dyfn_ros.recordings.depth_matching import Stamped, match_depth
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.frames import Notes, RecordedFrame
+from dyfn_ros.recordings.ground_truth import GroundTruth
+from dyfn_ros.recordings.storage.base import Recorded, Storage
+from dyfn_ros.recordings.topics import Topics
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 
 
 class RosRecording:

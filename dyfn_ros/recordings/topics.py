@@ -8,10 +8,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dyfn_ros.compressed_depth import is_compressed_depth
-from dyfn_ros.recorded import Storage
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rosbags_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from dyfn_ros.messages.compressed_depth import is_compressed_depth
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.storage.base import Storage
+from dyfn_ros.recordings.typestore import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}

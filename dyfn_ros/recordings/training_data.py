@@ -30,9 +30,9 @@ from dyfn_core.data.frames import (
     RgbdFrame,
     camera_intrinsics,
 )
-from dyfn_ros.recordings import RecordedFrame, RecordingError, open_recording
-from dyfn_ros.storage import is_recording, open_storage
-from dyfn_ros.topics import listed_topics
+from dyfn_ros.recordings.open import RecordedFrame, RecordingError, open_recording
+from dyfn_ros.recordings.storage.open import is_recording, open_storage
+from dyfn_ros.recordings.topics import listed_topics
 
 EXPECTED = "a rosbag2 folder, .mcap, .db3 or .bag file with a colour and a depth image topic"
 FORMAT = 1  # of the folder of pictures

@@ -14,9 +14,9 @@ import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from dyfn_ros.finished_file import OutputError, cannot_write
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rosbags_messages import (
+from dyfn_core.files import OutputError, cannot_write
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,

@@ -7,8 +7,7 @@ import json
 import multiprocessing
 import re
 import sys
-import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import Connection
@@ -17,17 +16,17 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from dyfn_ros.finished_file import finished_file
-from dyfn_ros.fleet_summary import Row, write_summary
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, ModelLoader, load, replay
-from dyfn_ros.replay_options import Options, split
-from dyfn_ros.rgbd_folder import is_rgbd_folder
+from dyfn_core.files import finished_file
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
+from dyfn_ros.replay.batch_summary import Row, write_summary
+from dyfn_ros.replay.jobs import CRASHED, Job, Outcome, Runner, run_one
+from dyfn_ros.replay.options import Options, split
+from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, ModelLoader, load
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
-CRASHED = 1  # the code of a recording whose worker died, or failed in a way that is our fault
 USABLE = (ALL, PARTIAL)
 RECORDING_FILE = re.compile(r"(?P<name>.+)\.(mcap|db3|bag)(\.zstd)?")
 PART = re.compile(r"(?P<name>.*)_\d+")
@@ -41,31 +40,6 @@ class FleetOptions:
 
     jobs: int = 1
     ray: str | None = None
-
-
-@dataclass(frozen=True)
-class Job:
-    """One image topic of a recording to replay.
-
-    name: of its folder and row. key: of all that decides the result.
-    """
-
-    name: str
-    options: Options
-    key: str
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a replay ended: the exit code that dyfn-replay gives for it alone, or CRASHED."""
-
-    code: int
-    reason: str = ""
-    traceback: str = ""
-
-
-# Runs jobs and gives each with its outcome, in any order.
-Runner = Callable[[Sequence[Job], ModelLoader], Iterator[tuple[Job, Outcome]]]
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
@@ -205,7 +179,7 @@ def replay_all(
 
 def _runner(fleet: FleetOptions) -> Runner:
     if fleet.ray is not None:
-        from dyfn_ros.fleet_ray import ray_runner
+        from dyfn_ros.replay.batch_ray import ray_runner
 
         return ray_runner(fleet.ray, fleet.jobs)
     return lambda jobs, loader: run_locally(jobs, loader, fleet.jobs)
@@ -234,18 +208,6 @@ def _row(job: Job, outcome: Outcome) -> Row:
     if outcome.code in USABLE:
         metrics = json.loads((job.options.out / "metrics.json").read_text(encoding="utf-8"))
     return Row(job.name, str(job.options.recording), outcome.code, outcome.reason, metrics)
-
-
-def run_one(options: Options, loader: ModelLoader) -> Outcome:
-    """Replay one recording; every exception becomes an outcome."""
-    try:
-        metrics = replay(options, loader)
-    except (RecordingError, ValueError, OSError) as error:
-        return Outcome(UNUSABLE, str(error))
-    except Exception as error:
-        return Outcome(CRASHED, f"{type(error).__name__}: {error}", traceback.format_exc())
-    losses = metrics["recording"]["losses"]
-    return Outcome(PARTIAL if losses else ALL, "; ".join(losses))
 
 
 def run_locally(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from dyfn_ros.finished_file import OutputError
-from dyfn_ros.fleet import CRASHED, Job, Outcome, Runner, run_one
-from dyfn_ros.replay import ModelLoader
+from dyfn_core.files import OutputError
+from dyfn_ros.replay.jobs import CRASHED, Job, Outcome, Runner, run_one
+from dyfn_ros.replay.run import ModelLoader
 
 LOCAL = "local"  # Ray's own word for a cluster of this machine, made for this run
 

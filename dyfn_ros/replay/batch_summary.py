@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap
 
-from dyfn_core.evaluation.report import format_cell
-from dyfn_ros.finished_file import finished_file
+from dyfn_core.evaluation.report.html import format_cell
+from dyfn_core.files import finished_file
 
 SCORES = {
     "image_abs_rel": ("image", "abs_rel"),

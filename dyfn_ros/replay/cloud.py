@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.evaluation.cloud_error import write_ply
-from dyfn_core.evaluation.cloud_pictures import draw_fused
+from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
+from dyfn_core.evaluation.reconstruction.cloud_pictures import draw_fused
+from dyfn_core.files import finished_file
 from dyfn_core.geometry.registration import Similarity
 from dyfn_core.geometry.voxel_grid import VoxelGrid
-from dyfn_ros.finished_file import finished_file
-from dyfn_ros.frame_spool import FrameSpool, SmallFrame
-from dyfn_ros.replay_video import Alignment
+from dyfn_ros.replay.frame_spool import FrameSpool, SmallFrame
+from dyfn_ros.replay.video import Alignment
 
 
 def write_cloud(

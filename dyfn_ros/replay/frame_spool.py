@@ -11,11 +11,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.evaluation.protocols import to_shape
+from dyfn_core.files import cannot_write
 from dyfn_core.geometry.edges import flying_pixels
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.finished_file import cannot_write
-from dyfn_ros.recordings import RecordedFrame
+from dyfn_core.scoring.protocols import to_shape
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.recordings.open import RecordedFrame
 
 MAX_SIDE = 320  # pixels of the longer side of what is kept
 EDGE = 0.05  # relative depth step between neighbours that makes both flying pixels

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.protocols import FrameScore, sample_grid
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.messages import CLOUD_OFFSETS, CLOUD_STEP, depth_fields, pack_cloud
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.recordings import RecordedFrame
-from dyfn_ros.rosbags_messages import (
+from dyfn_core.scoring.protocols import FrameScore, sample_grid
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.messages.clouds import CLOUD_OFFSETS, CLOUD_STEP, pack_cloud
+from dyfn_ros.messages.images import depth_fields
+from dyfn_ros.recordings.open import RecordedFrame
+from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     FLOAT,
@@ -21,6 +21,7 @@ from dyfn_ros.rosbags_messages import (
     camera_info,
     header,
 )
+from dyfn_ros.recordings.writer import RecordingWriter
 
 MAX_POINTS = 20_000
 _FLOAT32 = 7  # sensor_msgs/PointField

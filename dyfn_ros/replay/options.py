@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from dyfn_core.evaluation.predictions import QUANTITIES
+from dyfn_core.argument_types import above_zero, at_least_one, not_negative
+from dyfn_core.evaluation.benchmarks.predictions import QUANTITIES
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.arguments import above_zero, at_least_one, not_negative
-from dyfn_ros.recordings import image_topics
-from dyfn_ros.replay_outputs import DEFAULT, FILES, VOXEL, parse_outputs
-from dyfn_ros.threads import THREADS
+from dyfn_core.threads import THREADS
+from dyfn_ros.recordings.open import image_topics
+from dyfn_ros.replay.outputs import DEFAULT, FILES, VOXEL, parse_outputs
 
 
 @dataclass(frozen=True)

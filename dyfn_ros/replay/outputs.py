@@ -13,17 +13,17 @@ from typing import Protocol
 
 import numpy as np
 
-from dyfn_core.evaluation.protocols import FrameScore
+from dyfn_core.files import cannot_write
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.finished_file import cannot_write
-from dyfn_ros.frame_spool import FrameSpool
-from dyfn_ros.poses import PoseError, PoseLookup, open_poses
-from dyfn_ros.recordings import RecordedFrame
-from dyfn_ros.replay_cloud import write_cloud
-from dyfn_ros.replay_recording import ReplayRecording
-from dyfn_ros.replay_rerun import RerunRecording
-from dyfn_ros.replay_video import Alignment, write_video
+from dyfn_core.scoring.protocols import FrameScore
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.recordings.open import RecordedFrame
+from dyfn_ros.recordings.poses import PoseError, PoseLookup, open_poses
+from dyfn_ros.replay.cloud import write_cloud
+from dyfn_ros.replay.frame_spool import FrameSpool
+from dyfn_ros.replay.mcap import ReplayRecording
+from dyfn_ros.replay.rerun import RerunRecording
+from dyfn_ros.replay.video import Alignment, write_video
 
 MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
 FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.protocols import FrameScore
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.finished_file import OutputError
-from dyfn_ros.recordings import RecordedFrame
-from dyfn_ros.replay_recording import score_values, subsampled
+from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.files import OutputError
+from dyfn_core.scoring.protocols import FrameScore
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.recordings.open import RecordedFrame
+from dyfn_ros.replay.mcap import score_values, subsampled
 
 APPLICATION = "dyfn_replay"
 PATIENCE = 60.0  # seconds for the library's thread to write what it still holds

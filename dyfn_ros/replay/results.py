@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.report import Section, Table, write_report
+from dyfn_core.evaluation.report.html import Section, Table, write_report
+from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import COLUMNS, SequenceEvaluation
-from dyfn_core.evaluation.sequence_report import sequence_sections
-from dyfn_ros.finished_file import finished_file
-from dyfn_ros.recordings import Recording
+from dyfn_core.files import finished_file
+from dyfn_ros.recordings.open import Recording
 
 if TYPE_CHECKING:
-    from dyfn_ros.replay_options import Options
+    from dyfn_ros.replay.options import Options
 
 
 CONTROLS_NOTE = (

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from itertools import islice
@@ -15,25 +14,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.predictions import scored_quantity
-from dyfn_core.evaluation.protocols import FrameScore, SequenceScorer, predicted, to_shape
-from dyfn_core.evaluation.report import text_table
-from dyfn_core.evaluation.sequence import SequenceEvaluation, score_table
+from dyfn_core.evaluation.benchmarks.predictions import scored_quantity
+from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
-from dyfn_ros.recordings import (
+from dyfn_core.scoring.protocols import FrameScore, SequenceScorer, predicted, to_shape
+from dyfn_core.stream.scene_cut_hook import SceneCutHook
+from dyfn_core.stream.session import CameraStream, StreamFrame, stream_maker
+from dyfn_core.threads import computing_threads
+from dyfn_ros.recordings.open import (
     FolderRecording,
     RecordedFrame,
     Recording,
     RecordingError,
     open_recording,
 )
-from dyfn_ros.replay_options import Command, Options, parse, split
-from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
-from dyfn_ros.replay_results import Result, results_by_name, write_results
-from dyfn_ros.replay_video import Alignment
-from dyfn_ros.scene_cut import SceneCutHook
-from dyfn_ros.threads import computing_threads
+from dyfn_ros.replay.options import Options
+from dyfn_ros.replay.outputs import OutputOptions, ReplayOutputs
+from dyfn_ros.replay.results import Result, write_results
+from dyfn_ros.replay.video import Alignment
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -180,7 +178,7 @@ def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | No
 
 def _run_controls(options: Options, model: GeometryModel) -> dict[str, SequenceScorer]:
     """The same frames with each of latent_controls in DyFN's place."""
-    from dyfn_core.evaluation.controls import latent_controls, stabilized_by
+    from dyfn_core.models.controls import latent_controls, stabilized_by
 
     found = {}
     for name, control in latent_controls(model).items():
@@ -245,51 +243,3 @@ def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
         recording.notes.warnings[reason] += 1
 
     return ReplayOutputs(options.out, options.recording, chosen, warn)
-
-
-def main(arguments: Sequence[str] | None = None, loader: ModelLoader = load) -> int:
-    """-> exit code."""
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    command = parse(arguments)
-    try:
-        return _replay_command(command, loader)
-    except (RecordingError, ValueError, OSError) as error:
-        print(f"dyfn-replay: {error}", file=sys.stderr)
-        return UNUSABLE
-    except KeyboardInterrupt:
-        print("dyfn-replay: interrupted, unfinished results were not written", file=sys.stderr)
-        return 130
-
-
-def _replay_command(command: Command, loader: ModelLoader) -> int:
-    from dyfn_ros import fleet  # which is above this module
-
-    if fleet.is_many(command.recordings):
-        chosen = fleet.FleetOptions(command.jobs, command.ray)
-        recordings = fleet.expand(command.recordings)
-        return fleet.replay_all(recordings, command.options, chosen, loader)
-    codes = {_replay_and_tell(one, loader) for one in split(command.options)}
-    return codes.pop() if len(codes) == 1 else PARTIAL
-
-
-def _replay_and_tell(options: Options, loader: ModelLoader) -> int:
-    try:
-        metrics = replay(options, loader)
-    except (RecordingError, ValueError, OSError) as error:
-        print(f"dyfn-replay: {error}", file=sys.stderr)
-        return UNUSABLE
-    notes = metrics["recording"]
-    for kind, word in (("losses", "loss"), ("warnings", "warning")):
-        for text, count in notes[kind].items():
-            times = f" ({count} times)" if count > 1 else ""
-            print(f"dyfn-replay: {word}: {text}{times}", file=sys.stderr)
-    print(f"{metrics['frames']} frames of {options.recording}")
-    print(text_table(score_table(results_by_name(metrics))))
-    written = [name for name in FILES.values() if (options.out / name).exists()]
-    listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
-    print(f"results in {options.out}: {listed}")
-    return PARTIAL if notes["losses"] else ALL
-
-
-if __name__ == "__main__":
-    sys.exit(main())

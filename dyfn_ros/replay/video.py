@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.evaluation.pictures import MAX_ERROR, colour_depth, colour_error, depth_range
-from dyfn_core.evaluation.protocols import align_depth
-from dyfn_ros.finished_file import OutputError, finished_file
-from dyfn_ros.frame_spool import FrameSpool, SmallFrame
+from dyfn_core.evaluation.report.pictures import MAX_ERROR, colour_depth, colour_error, depth_range
+from dyfn_core.files import OutputError, finished_file
+from dyfn_core.scoring.protocols import align_depth
+from dyfn_ros.replay.frame_spool import FrameSpool, SmallFrame
 
 CODEC = "libx264"
 TICKS = 1000  # of a second; the time base

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from dyfn_core.data.worlds.renderer import Camera
-from dyfn_core.data.worlds.scene import Scene
+from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.scene.scene import Scene
 
 FAR = 200.0
 CLEARANCE = 0.3

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.data.worlds.cameras import CLEARANCE, FreeSpace, Lens, pose_at
-from dyfn_core.data.worlds.renderer import Camera
+from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
+from dyfn_worlds.render.renderer import Camera
 
 RATE = 60.0  # samples a second of a path
 # how a camera moves: metres a second, radians of slow turning, share

@@ -8,14 +8,14 @@ from functools import partial
 
 import numpy as np
 
-from dyfn_core.data.worlds.actors import STILL, Moment, Placement
-from dyfn_core.data.worlds.cameras import FreeSpace, Lens, random_view
-from dyfn_core.data.worlds.occlusion import shade_corners
-from dyfn_core.data.worlds.paths import CameraPath, random_path
-from dyfn_core.data.worlds.renderer import Camera, Look, Picture, Renderer
-from dyfn_core.data.worlds.scene import Scene
-from dyfn_core.data.worlds.shards import View
-from dyfn_core.data.worlds.staging import LightScript, stage, stand
+from dyfn_worlds.camera.cameras import FreeSpace, Lens, random_view
+from dyfn_worlds.camera.paths import CameraPath, random_path
+from dyfn_worlds.camera.staging import LightScript, stage, stand
+from dyfn_worlds.render.occlusion import shade_corners
+from dyfn_worlds.render.renderer import Camera, Look, Picture, Renderer
+from dyfn_worlds.scene.actors import STILL, Moment, Placement
+from dyfn_worlds.scene.scene import Scene
+from dyfn_worlds.shards import View
 
 PROBE_SHRINK = 4
 MAX_SUBFRAMES = 8

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.data.worlds.actors import Actor, Placement
-from dyfn_core.data.worlds.cameras import FAR, FreeSpace
-from dyfn_core.data.worlds.paths import CameraPath
-from dyfn_core.data.worlds.renderer import Camera
+from dyfn_worlds.camera.cameras import FAR, FreeSpace
+from dyfn_worlds.camera.paths import CameraPath
+from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.scene.actors import Actor, Placement
 
 LIGHTING = {"steady": 0.5, "drift": 0.2, "switch": 0.18, "dip": 0.12}
 STEP_HEIGHT = 0.25

@@ -6,12 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dyfn_core.data.worlds import md3, textures
-from dyfn_core.data.worlds.actors import Actor, stiff_actor
-from dyfn_core.data.worlds.furniture import Piece, Showroom
-from dyfn_core.data.worlds.quake import GameFiles
-from dyfn_core.data.worlds.scene import Scene, SceneBuilder
-from dyfn_core.data.worlds.vary import tint
+from dyfn_worlds.maps import md3
+from dyfn_worlds.maps.quake import GameFiles
+from dyfn_worlds.rooms.furniture import Piece, Showroom
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.actors import Actor
+from dyfn_worlds.scene.builder import SceneBuilder, stiff_actor
+from dyfn_worlds.scene.scene import Scene
+from dyfn_worlds.scene.vary import tint
 
 PROP_NAMES = ("chair", "stool", "box", "crate", "dustbin", "basket", "suitcase", "cart", "trolley",
               "puff", "stroller", "wheelbarrow", "tricycle", "scooter", "dog", "cat",

@@ -13,9 +13,9 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from dyfn_core.data.worlds.actors import Actor
-from dyfn_core.data.worlds.quake import GameFiles
-from dyfn_core.data.worlds.scene import SceneBuilder, new_vertices
+from dyfn_worlds.maps.quake import GameFiles
+from dyfn_worlds.scene.actors import Actor
+from dyfn_worlds.scene.builder import SceneBuilder, new_vertices
 
 HEADER = np.dtype(
     [("ident", "S4"), ("version", "<i4"), ("name", "S64"), ("flags", "<i4"), ("frames", "<i4"),

@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.data.worlds.scene import LIGHTMAP_SIZE, Scene, SceneBuilder, new_vertices
+from dyfn_worlds.scene.builder import SceneBuilder, new_vertices
+from dyfn_worlds.scene.scene import LIGHTMAP_SIZE, Scene
 
 UNITS_PER_METRE = 32.0
 PATCH_STEPS = 4

@@ -12,9 +12,7 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from dyfn_core.data.worlds.actors import STILL, Actor, Moment, Placement
-from dyfn_core.data.worlds.scene import LIGHTMAP_SIZE, TEXTURE_SIZE, Light, Scene
-from dyfn_core.data.worlds.shaders import (
+from dyfn_worlds.render.shaders import (
     ACTOR_SHADOW_SIZE,
     DEPTH_SHADER,
     FRAGMENT_SHADER,
@@ -23,6 +21,8 @@ from dyfn_core.data.worlds.shaders import (
     SHADOW_SIZE,
     VERTEX_SHADER,
 )
+from dyfn_worlds.scene.actors import STILL, Actor, Moment, Placement
+from dyfn_worlds.scene.scene import LIGHTMAP_SIZE, TEXTURE_SIZE, Light, Scene
 
 NEAR = 0.05
 MIRROR_SIZE = 128

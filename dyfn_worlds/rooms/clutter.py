@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.data.worlds import textures
-from dyfn_core.data.worlds.scene import SceneBuilder, new_vertices
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.builder import SceneBuilder, new_vertices
 
 GREENS = np.array([[0.05, 0.16, 0.03], [0.10, 0.24, 0.05], [0.03, 0.10, 0.04], [0.16, 0.25, 0.08]])
 

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from trimesh.resolvers import ZipResolver
 
-from dyfn_core.data.worlds.scene import SceneBuilder, fit_texture, new_vertices
+from dyfn_worlds.scene.builder import SceneBuilder, fit_texture, new_vertices
 
 MAX_MODEL_BYTES = 400_000
 SMALL = 0.45

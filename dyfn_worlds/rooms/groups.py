@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dyfn_core.data.worlds import clutter, textures
-from dyfn_core.data.worlds.clutter import Spot
-from dyfn_core.data.worlds.furniture import Piece
-from dyfn_core.data.worlds.room import Room
+from dyfn_worlds.rooms import clutter
+from dyfn_worlds.rooms.clutter import Spot
+from dyfn_worlds.rooms.furniture import Piece
+from dyfn_worlds.rooms.room import Room
+from dyfn_worlds.scene import textures
 
 
 def spot(room: Room, x: float, y: float, yaw: float, z: float = 0.0) -> Spot:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyfn_core.data.worlds import textures
-from dyfn_core.data.worlds.furniture import Piece, Showroom
-from dyfn_core.data.worlds.palette import Palette
-from dyfn_core.data.worlds.scene import SceneBuilder, Window
+from dyfn_worlds.rooms.furniture import Piece, Showroom
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.builder import SceneBuilder
+from dyfn_worlds.scene.palette import Palette
+from dyfn_worlds.scene.scene import Window
 
 
 @dataclass

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dyfn_core.data.worlds import clutter, groups, textures
-from dyfn_core.data.worlds.furniture import Piece, Showroom
-from dyfn_core.data.worlds.palette import Palette
-from dyfn_core.data.worlds.room import Room
-from dyfn_core.data.worlds.scene import Light, Scene, Window
+from dyfn_worlds.rooms import clutter, groups
+from dyfn_worlds.rooms.furniture import Piece, Showroom
+from dyfn_worlds.rooms.room import Room
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.palette import Palette
+from dyfn_worlds.scene.scene import Light, Scene, Window
 
 TOPS = re.compile(
     r"table|desk|cabinet|counter|chest|dresser|drawer|console|nightstand|sideboard|bookcase|shel|"

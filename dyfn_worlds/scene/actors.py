@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.data.worlds.scene import SceneBuilder
-
 
 @dataclass(frozen=True)
 class Actor:
@@ -74,23 +72,3 @@ class Moment:
 
 
 STILL = Moment()
-
-
-def stiff_actor(name: str, mesh: SceneBuilder, yaw: float = 0.0) -> Actor:
-    """What was built in `mesh` (around its origin) as one stiff actor.
-
-    Its texture layers are those of `mesh`: share the texture table with the scene's builder.
-    """
-    scene = mesh.build()
-    points = scene.vertices["position"]
-    return Actor(
-        name=name,
-        vertices=scene.vertices,
-        positions=points[None].copy(),
-        normals=scene.vertices["normal"][None].copy(),
-        triangles=scene.triangles,
-        walk=(0, 1),
-        idle=(0, 1),
-        height=float(points[:, 2].max()),
-        radius=float(np.linalg.norm(points[:, :2], axis=1).max()),
-    )

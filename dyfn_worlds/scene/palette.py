@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_core.data.worlds import textures
-from dyfn_core.data.worlds.scene import TEXTURE_SIZE, fit_texture
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.builder import fit_texture
+from dyfn_worlds.scene.scene import TEXTURE_SIZE
 
 Draw = Callable[[np.random.Generator], np.ndarray]
 SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")

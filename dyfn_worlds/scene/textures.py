@@ -7,7 +7,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from dyfn_core.data.worlds.scene import TEXTURE_SIZE as N
+from dyfn_worlds.scene.scene import TEXTURE_SIZE as N
 
 Color = np.ndarray
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from dyfn_core.data.worlds.scene import Scene, fit_texture
+from dyfn_worlds.scene.builder import fit_texture
+from dyfn_worlds.scene.scene import Scene
 
 
 def vary(scene: Scene, rng: np.random.Generator, pool: list[np.ndarray], swap: float) -> Scene:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 FOV_X = 70.0
 
@@ -102,7 +102,7 @@ def renderer() -> Any:
     """A Renderer of small_camera.SIZE; skips without OpenGL."""
     from small_camera import SIZE
 
-    from dyfn_core.data.worlds.renderer import Renderer
+    from dyfn_worlds.render.renderer import Renderer
 
     try:
         return Renderer(SIZE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dyfn_core.data.frames import RgbdFrame
-from dyfn_core.evaluation.matching import Matches
+from dyfn_core.evaluation.reconstruction.matching import Matches
 
 SIZE = (60, 80)
 FOCAL = 60.0

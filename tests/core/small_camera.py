@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dyfn_core.data.worlds.renderer import Camera
+from dyfn_worlds.render.renderer import Camera
 
 SIZE = (48, 64)
 

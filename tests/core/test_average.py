@@ -9,8 +9,8 @@ import torch
 
 from dyfn_core.cli.train import main
 from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.mini import MiniConfig, MiniModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 SMALL = MiniConfig(latent_channels=16, stage_channels=(16, 8), context_layers=0)
 

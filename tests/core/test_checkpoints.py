@@ -14,9 +14,9 @@ from safetensors.torch import save_file
 
 import dyfn_core
 from dyfn_core.models import CheckpointError, checkpoints, load_model, save_model
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 Official = dict[str, Any]
 

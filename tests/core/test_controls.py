@@ -9,16 +9,8 @@ import pytest
 import torch
 from conftest import PinholeModel, picture
 
-from dyfn_core.evaluation.controls import (
-    VARIANTS,
-    StatisticsControl,
-    ema_control,
-    frozen_control,
-    gap_closed,
-    score_variants,
-    stabilized_by,
-    variant_table,
-)
+from dyfn_core.evaluation.variants import VARIANTS, gap_closed, score_variants, variant_table
+from dyfn_core.models.controls import StatisticsControl, ema_control, frozen_control, stabilized_by
 
 
 def statistics(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -35,7 +35,7 @@ from dyfn_core.data.datasets import open_kind, recognise
 from dyfn_core.data.frames import DataError, FrameError, NumberedSequence, RgbdFrame
 from dyfn_core.data.pool import DataPool, DataSpec, cut_sequences, open_pool
 from dyfn_core.training.config import BaseRunConfig, ConfigError, read_config
-from dyfn_core.training.validation import spread_examples
+from dyfn_core.training.tasks.validation import spread_examples
 
 SIZE = (48, 64)
 CAMERA = (50.0, 52.0, 31.0, 25.0)  # the first pixel's corner at 0

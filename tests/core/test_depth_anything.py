@@ -9,9 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from dyfn_core.evaluation.controls import score_variants
-from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.evaluation.sequence import SequenceEvaluation
+from dyfn_core.evaluation.variants import score_variants
 from dyfn_core.models.checkpoints import (
     CheckpointError,
     build_model,
@@ -20,8 +19,9 @@ from dyfn_core.models.checkpoints import (
     save_model,
 )
 from dyfn_core.models.depth_anything import DepthAnythingConfig, DepthAnythingModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
-from dyfn_core.stream import DepthStream, push_together
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.scoring.protocols import SequenceScorer
+from dyfn_core.stream.depth_stream import DepthStream, push_together
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.exact import Conv2d, GroupNorm, Linear, resize
+from dyfn_core.models.deterministic import Conv2d, GroupNorm, Linear, resize
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.moge import MoGeModel
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
-from dyfn_core.stream import DepthStream, push_together
+from dyfn_core.stream.depth_stream import DepthStream, push_together
 
 THREADS = (1, 2, 4)
 MOGE = {

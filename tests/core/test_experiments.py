@@ -12,8 +12,8 @@ import yaml
 from training_toys import tiny_base, tiny_stabilizer_settings
 
 from dyfn_core.cli.train import main
-from dyfn_core.evaluation.controls import VariantScore
 from dyfn_core.evaluation.empirical_study import change_statistics, statistics_grid
+from dyfn_core.evaluation.variants import VariantScore
 from dyfn_core.experiments.declared import EXPERIMENTS, find_experiments
 from dyfn_core.experiments.report import ArmScores, trained_table, verdicts, write_section
 from dyfn_core.models.base import Latent

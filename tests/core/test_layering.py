@@ -90,7 +90,7 @@ def test_the_check_itself_sees_every_kind_of_import() -> None:
         [
             "import rclpy.node",
             "def f():",
-            "    from dyfn_core.stream import DepthStream",
+            "    from dyfn_core.stream.depth_stream import DepthStream",
             "from dyfn_core import evaluation",
             "from ..training import trainer",
             "from .base import Latent",
@@ -99,7 +99,7 @@ def test_the_check_itself_sees_every_kind_of_import() -> None:
     )
     assert violations("dyfn_core.models.moge", source) == [
         "dyfn_core.evaluation",
-        "dyfn_core.stream",
+        "dyfn_core.stream.depth_stream",
         "dyfn_core.training",
         "rclpy.node",
     ]

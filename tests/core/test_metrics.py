@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyfn_core.evaluation.metrics import METRICS, depth_metrics, mean_metrics
+from dyfn_core.scoring.metrics import METRICS, depth_metrics, mean_metrics
 
 GOLDEN_NAMES = {
     "abs_relative_difference": "abs_rel",

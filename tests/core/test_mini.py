@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.models.efficientnet import BATCH_NORM_EPS, EfficientNetLite0, imagenet_weights
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
 
 SMALL = MiniConfig(latent_channels=16, stage_channels=(16, 8), context_channels=24)
 

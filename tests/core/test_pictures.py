@@ -6,7 +6,16 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_core.evaluation.pictures import (
+from dyfn_core.evaluation.report.html import (
+    Picture,
+    Section,
+    Table,
+    Text,
+    format_cell,
+    text_table,
+    write_report,
+)
+from dyfn_core.evaluation.report.pictures import (
     INVALID,
     FrameStrip,
     colour_depth,
@@ -15,15 +24,6 @@ from dyfn_core.evaluation.pictures import (
     depth_range,
     draw_cloud,
     encode_picture,
-)
-from dyfn_core.evaluation.report import (
-    Picture,
-    Section,
-    Table,
-    Text,
-    format_cell,
-    text_table,
-    write_report,
 )
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dyfn_core.evaluation.protocols import (
+from dyfn_core.scoring.protocols import (
     ControlledScorer,
     SequenceScorer,
     constant,

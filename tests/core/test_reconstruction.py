@@ -12,10 +12,15 @@ from conftest import PinholeModel
 from made_room import ExactMatcher, RoomSequence, camera_pose, room_frame
 
 from dyfn_core.data.frames import FrameError
-from dyfn_core.evaluation.cloud_error import cloud_error, write_ply
-from dyfn_core.evaluation.matching import MatchWindow, build_matcher, partners, sample_at
-from dyfn_core.evaluation.reconstruction import Reconstruction, ReconstructionOptions
-from dyfn_core.evaluation.reconstruction_runs import (
+from dyfn_core.evaluation.reconstruction.cloud_error import cloud_error, write_ply
+from dyfn_core.evaluation.reconstruction.matching import (
+    MatchWindow,
+    build_matcher,
+    partners,
+    sample_at,
+)
+from dyfn_core.evaluation.reconstruction.poses import Reconstruction, ReconstructionOptions
+from dyfn_core.evaluation.reconstruction.runs import (
     BASE,
     TRUE_DEPTH,
     WITH_DYFN,
@@ -24,7 +29,7 @@ from dyfn_core.evaluation.reconstruction_runs import (
     reconstruct_sequence,
     reconstruction_table,
 )
-from dyfn_core.evaluation.trajectory import trajectory_error
+from dyfn_core.evaluation.reconstruction.trajectory import trajectory_error
 from dyfn_core.geometry.registration import RegistrationError, Similarity
 
 FRAMES = 16

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyfn_core.evaluation.report import Curves, Histogram, KeyFigures, Section, write_report
-from dyfn_core.evaluation.report_curves import curves_html, decimate, histogram_html
+from dyfn_core.evaluation.report.curves import curves_html, decimate, histogram_html
+from dyfn_core.evaluation.report.html import Curves, Histogram, KeyFigures, Section, write_report
+from dyfn_core.evaluation.report.sequence import sequence_sections
+from dyfn_core.evaluation.report.worst_frames import KEPT, STRETCHES
 from dyfn_core.evaluation.sequence import SequenceEvaluation
-from dyfn_core.evaluation.sequence_report import sequence_sections
-from dyfn_core.evaluation.worst_frames import KEPT, STRETCHES
 
 LONG = 20_000
 

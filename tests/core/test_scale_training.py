@@ -16,10 +16,15 @@ from dyfn_core.data.clips import draw_batch, find_sequences
 from dyfn_core.models.base import AffinePoints, Latent
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.training.config import ConfigError, ScaleRunConfig, read_config
-from dyfn_core.training.latents import encode_clips
-from dyfn_core.training.run_folder import read_log
-from dyfn_core.training.scale import ScaleTask
-from dyfn_core.training.summaries import decoded_z, mean_log, scale_slope, summarise_clips
+from dyfn_core.training.loop.run_folder import read_log
+from dyfn_core.training.tasks.dyfn_linearized import ScaleTask
+from dyfn_core.training.tasks.gru_input_cache import (
+    decoded_z,
+    mean_log,
+    scale_slope,
+    summarise_clips,
+)
+from dyfn_core.training.tasks.latent_cache import encode_clips
 
 
 @pytest.fixture(scope="module")

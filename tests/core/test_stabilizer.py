@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.prediction import StreamState
 
 KINDS = ["convgru", "gru"]

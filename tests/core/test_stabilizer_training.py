@@ -27,17 +27,17 @@ from training_toys import (
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
-from dyfn_core.training.checkpoint import read_state
 from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
     StabilizerRunConfig,
     read_config,
 )
-from dyfn_core.training.latents import encode_clips
-from dyfn_core.training.run_folder import read_log
+from dyfn_core.training.loop.checkpoint import read_state
+from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.scaling_curve import images_at, last_doubling
-from dyfn_core.training.stabilizer import StabilizerTask
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.latent_cache import encode_clips
 
 
 @pytest.fixture(scope="module")

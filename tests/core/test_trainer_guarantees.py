@@ -18,16 +18,16 @@ import yaml
 from training_toys import PATIENCE, ToyTask, environment, run_toy, toy_config, wait_for_step
 
 from dyfn_core.models.checkpoints import read_checkpoint
-from dyfn_core.training.checkpoint import (
+from dyfn_core.training.loop.checkpoint import (
     PREVIOUS_FILE,
     STATE_FILE,
     DamagedCheckpointError,
     read_state,
     write_state,
 )
-from dyfn_core.training.run_folder import read_log
-from dyfn_core.training.run_state import moments
-from dyfn_core.training.trainer import InterruptedRunError, Trainer, TrainingError
+from dyfn_core.training.loop.run_folder import read_log
+from dyfn_core.training.loop.run_state import moments
+from dyfn_core.training.loop.trainer import InterruptedRunError, Trainer, TrainingError
 
 LONG: dict[str, Any] = {"steps": 120, "validate_every": 50, "picture_every": 1000}
 

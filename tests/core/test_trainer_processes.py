@@ -28,12 +28,12 @@ from training_toys import (
 
 from dyfn_core.cli import train
 from dyfn_core.models.checkpoints import read_checkpoint
-from dyfn_core.training import latents
-from dyfn_core.training.checkpoint import read_state
 from dyfn_core.training.config import ConfigError
-from dyfn_core.training.latents import CacheFolder
-from dyfn_core.training.processes import Processes
-from dyfn_core.training.run_folder import read_log
+from dyfn_core.training.loop.checkpoint import read_state
+from dyfn_core.training.loop.processes import Processes
+from dyfn_core.training.loop.run_folder import read_log
+from dyfn_core.training.tasks import latent_cache as latents
+from dyfn_core.training.tasks.latent_cache import CacheFolder
 
 TOLERANCE = 2e-6  # float32 sums in another order, after six steps of AdamW at 1e-2
 

@@ -13,15 +13,15 @@ from made_frames import write_data_set
 from dyfn_core.cli.train import main
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.mini import MiniModel
-from dyfn_core.training.base import BaseTask
 from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
     StabilizerRunConfig,
     read_config,
 )
-from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.trainer import Trainer, TrainingError
+from dyfn_core.training.loop.trainer import Trainer, TrainingError
+from dyfn_core.training.tasks.base import BaseTask
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
 
 CONFIGS = Path(__file__).resolve().parents[2] / "config"
 TINY = {

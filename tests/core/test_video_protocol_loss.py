@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from dyfn_core.evaluation.protocols import SequenceScorer
 from dyfn_core.losses.video_protocol import video_protocol_loss
+from dyfn_core.scoring.protocols import SequenceScorer
 
 
 def clips(seed: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -21,9 +21,9 @@ from torch import Tensor
 from dyfn_core.models.checkpoints import save_model
 from dyfn_core.models.mini import MiniConfig, MiniModel
 from dyfn_core.training.config import RunConfig
-from dyfn_core.training.processes import Processes, share_of
-from dyfn_core.training.task import Task
-from dyfn_core.training.trainer import Trainer
+from dyfn_core.training.loop.processes import Processes, share_of
+from dyfn_core.training.loop.trainer import Trainer
+from dyfn_core.training.tasks.task import Task
 
 BATCH = 4
 PATIENCE = 300.0  # seconds for what another process does

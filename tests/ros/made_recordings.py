@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from dyfn_ros.rosbags_messages import IMAGE, TYPES, image_message
+from dyfn_ros.recordings.typestore import IMAGE, TYPES, image_message
 
 SIZE = (24, 32)
 STEP_NS = 100_000_000

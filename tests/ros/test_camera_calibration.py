@@ -10,8 +10,8 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
-from dyfn_ros.calibration import CalibrationRules, Calibrator, View, undistort_depth
-from dyfn_ros.messages import MessageError
+from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View, undistort_depth
 
 HEIGHT, WIDTH = 60, 80
 K = np.array([[70.0, 0, 41.0], [0, 72.0, 28.0], [0, 0, 1]])

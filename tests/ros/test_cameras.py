@@ -28,9 +28,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from tiny_model import FAILING, load_tiny
 
 from dyfn_core.geometry.edges import flying_pixels
-from dyfn_core.stream import DepthStream
-from dyfn_ros import messages
-from dyfn_ros.compressed_depth import decode_compressed_depth
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 
 BOTH = ("front", "left")
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -352,7 +352,7 @@ def test_a_distorted_lens_is_undone_or_refused(rig: Rig) -> None:
     rig.reset()
     image = frames(1)[0]
     got = as_depth(rig.play("front", [image])[0])
-    from dyfn_ros.calibration import CalibrationRules, Calibrator
+    from dyfn_ros.messages.rectify import CalibrationRules, Calibrator
 
     view = Calibrator(print).view(image, "optical", info, CalibrationRules())
     assert view.visible is not None

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_ros.compressed_depth import (
+from dyfn_ros.messages.compressed_depth import (
     decode_compressed_depth,
     encode_compressed_depth,
     is_compressed_depth,
 )
-from dyfn_ros.encodings import MessageError
-from dyfn_ros.rosbags_messages import compressed_message
+from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.recordings.typestore import compressed_message
 
 
 def png(values: np.ndarray) -> bytes:

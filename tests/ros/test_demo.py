@@ -13,10 +13,10 @@ from ros_graph import DEADLINE, HERE, own_domain
 from test_replay import rgbd
 from tiny_model import load_tiny
 
-from dyfn_ros import replay
-from dyfn_ros.demo import FAILED, OK, UNUSABLE, main
-from dyfn_ros.node_process import LiveError, NodeExitError, NodeProcess
-from dyfn_ros.rgbd_recording import write_rgbd_recording
+from dyfn_ros.demo.cli import FAILED, OK, UNUSABLE, main
+from dyfn_ros.demo.node_process import LiveError, NodeExitError, NodeProcess
+from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
+from dyfn_ros.replay import run as replay
 
 TINY_NODE = [sys.executable, str(HERE / "tiny_node.py")]
 
@@ -80,7 +80,7 @@ def test_a_signal_ends_the_demo_and_its_node(tmp_path: Path, number: int) -> Non
         "time.sleep(600)\n"
     )
     code = (
-        "import signal, sys\nfrom dyfn_ros.demo import main\n"
+        "import signal, sys\nfrom dyfn_ros.demo.cli import main\n"
         # a shell's background job inherits an ignored SIGINT
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.exit(main(sys.argv[1:], [sys.executable, {str(script)!r}]))"
@@ -132,7 +132,7 @@ def test_a_node_that_ignores_signals_is_killed(
         "for s in (signal.SIGINT, signal.SIGTERM): signal.signal(s, signal.SIG_IGN)\n"
         "print('deaf', flush=True); time.sleep(600)"
     )
-    monkeypatch.setattr("dyfn_ros.node_process.PATIENCE", (0.2, 0.2))
+    monkeypatch.setattr("dyfn_ros.demo.node_process.PATIENCE", (0.2, 0.2))
     process = NodeProcess(tmp_path / "node.log", {}, "/", [sys.executable, "-c", deaf])
     while "deaf" not in process.log.read_text():
         process.check()

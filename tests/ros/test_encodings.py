@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyfn_ros.encodings import (
+from dyfn_ros.messages.encodings import (
     COLOUR_ENCODINGS,
     MessageError,
     Raster,

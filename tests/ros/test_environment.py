@@ -10,10 +10,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from dyfn_ros import environment
+from dyfn_ros.node import environment
 
 PARTICIPANT = """
-from dyfn_ros.environment import prepare_environment
+from dyfn_ros.node.environment import prepare_environment
 prepare_environment()
 import os, rclpy
 rclpy.init()

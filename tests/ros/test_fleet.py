@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from tiny_model import load_tiny
 
-from dyfn_ros import fleet
-from dyfn_ros.fleet import CRASHED, Outcome, expand, is_many, plan, run_locally
-from dyfn_ros.fleet_summary import mean_of
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, Options, main, replay
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.replay import batch as fleet
+from dyfn_ros.replay.batch import expand, is_many, plan, run_locally
+from dyfn_ros.replay.batch_summary import mean_of
+from dyfn_ros.replay.cli import main
+from dyfn_ros.replay.jobs import CRASHED, Outcome
+from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, Options, replay
 
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
 

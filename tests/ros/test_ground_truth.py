@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from dyfn_core.geometry.projection import back_project, render_depth, resized_camera
-from dyfn_ros.compressed_depth import encode_compressed_depth
-from dyfn_ros.ground_truth import register_depth
-from dyfn_ros.metric_messages import Transform
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.recordings import RecordedFrame, RecordingError, open_recording
-from dyfn_ros.rosbags_messages import (
+from dyfn_ros.messages.compressed_depth import encode_compressed_depth
+from dyfn_ros.messages.references import Transform
+from dyfn_ros.recordings.ground_truth import register_depth
+from dyfn_ros.recordings.open import RecordedFrame, RecordingError, open_recording
+from dyfn_ros.recordings.typestore import (
     COMPRESSED_IMAGE,
     POINT_CLOUD,
     TYPES,
     compressed_message,
     header,
 )
+from dyfn_ros.recordings.writer import RecordingWriter
 
 COLOUR, SIZE = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]]), (48, 64)
 DEPTH, DEPTH_SIZE = np.array([[30.0, 0, 24.0], [0, 32.0, 20.0], [0, 0, 1]]), (41, 52)
@@ -165,8 +165,8 @@ def test_a_point_cloud_is_truth_when_it_is_named(tmp_path: Path) -> None:
 
 def test_stamps_of_recording_by_option(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "bag") as writer:
-        from dyfn_ros.rosbags_messages import IMAGE as KIND
-        from dyfn_ros.rosbags_messages import image_message
+        from dyfn_ros.recordings.typestore import IMAGE as KIND
+        from dyfn_ros.recordings.typestore import image_message
 
         for index in range(3):
             message = image_message(IMAGE, "rgb8", 0, "camera")  # a driver without a clock

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from dyfn_ros.make_recording import ALL, PARTIAL, UNUSABLE, main
-from dyfn_ros.poses import open_poses
-from dyfn_ros.recordings import RecordedFrame, open_recording
+from dyfn_ros.record.cli import ALL, PARTIAL, UNUSABLE, main
+from dyfn_ros.recordings.open import RecordedFrame, open_recording
+from dyfn_ros.recordings.poses import open_poses
 
 H, W = 24, 32
 STEREO_STAMPS = ("1305031102.175304", "1305031102.211214", "1305031103.275326")

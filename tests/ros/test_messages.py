@@ -18,9 +18,12 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
-from dyfn_ros import messages
-from dyfn_ros.compressed_image import Layout, decode_compressed, parse_format
-from dyfn_ros.messages import MessageError
+from dyfn_core.geometry.camera import valid_depth
+from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.camera_info import camera_info_message, decode_camera_info
+from dyfn_ros.messages.clouds import CLOUD_DTYPE, cloud_message, cloud_points, pack_cloud
+from dyfn_ros.messages.compressed_image import Layout, decode_compressed, parse_format
+from dyfn_ros.messages.images import MessageError
 
 K = [100.0, 0.0, 63.5, 0.0, 110.0, 47.5, 0.0, 0.0, 1.0]
 
@@ -77,7 +80,7 @@ def test_empty_data_is_refused_by_length() -> None:
 def test_module_needs_no_ros() -> None:
     code = (
         "import sys; sys.modules.update(dict.fromkeys(['rclpy', 'sensor_msgs', 'std_msgs']));"
-        "import dyfn_ros.messages, dyfn_ros.encodings; print('fine')"
+        "import dyfn_ros.messages.images, dyfn_ros.messages.clouds; print('fine')"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout == "fine\n", result.stderr
@@ -182,16 +185,16 @@ def test_any_bytes_are_a_picture_or_refused(tail: bytes, start: bytes) -> None:
 
 
 def test_calibration_is_k_and_knows_about_the_lens() -> None:
-    plain = messages.decode_camera_info(info(), 96, 128)
+    plain = decode_camera_info(info(), 96, 128)
     assert plain.matrix.tolist() == np.reshape(K, (3, 3)).tolist()
     assert not plain.distorted
-    assert messages.decode_camera_info(info(d=[0.1, 0, 0, 0, 0]), 96, 128).distorted
-    assert not messages.decode_camera_info(info(d=[0.0] * 5), 96, 128).distorted
+    assert decode_camera_info(info(d=[0.1, 0, 0, 0, 0]), 96, 128).distorted
+    assert not decode_camera_info(info(d=[0.0] * 5), 96, 128).distorted
 
 
 def test_rectified_images_take_p() -> None:
     p = [90.0, 0, 60, -4, 0, 91, 40, 0, 0, 0, 1, 0]
-    got = messages.decode_camera_info(info(p=p, d=[0.1] * 5), 96, 128, rectified=True)
+    got = decode_camera_info(info(p=p, d=[0.1] * 5), 96, 128, rectified=True)
     assert got.matrix.tolist() == [[90, 0, 60], [0, 91, 40], [0, 0, 1]]
     assert not got.distorted
 
@@ -209,7 +212,7 @@ def test_ros1_field_names_are_read_too() -> None:
         binning_x=0,
         binning_y=0,
     )
-    assert messages.decode_camera_info(old, 96, 128).matrix[0, 0] == 100
+    assert decode_camera_info(old, 96, 128).matrix[0, 0] == 100
 
 
 @settings(max_examples=60, deadline=None)
@@ -227,7 +230,7 @@ def test_binning_and_region_move_rays_with_their_pixels(
     message.roi.x_offset, message.roi.y_offset = x, y
     message.roi.width, message.roi.height = 64, 48
     bx, by = max(bin_x, 1), max(bin_y, 1)
-    m = messages.decode_camera_info(message, 48 // by, 64 // bx).matrix
+    m = decode_camera_info(message, 48 // by, 64 // bx).matrix
     u, v = 5, 3
     full_u, full_v = x + u * bx + (bx - 1) / 2, y + v * by + (by - 1) / 2
     assert (u - m[0, 2]) / m[0, 0] == pytest.approx((full_u - K[2]) / K[0])
@@ -250,13 +253,13 @@ def test_binning_and_region_move_rays_with_their_pixels(
 )
 def test_unusable_calibrations_say_why(fields: dict[str, Any], match: str) -> None:
     with pytest.raises(MessageError, match=match):
-        messages.decode_camera_info(info(**fields), 96, 128)
+        decode_camera_info(info(**fields), 96, 128)
 
 
 def test_depth_message_is_float_metres_with_nan_and_never_zero() -> None:
     depth = np.array([[1.5, 0.0, np.inf], [-2.0, np.nan, 3.0]], np.float32)
     mask = np.array([[1, 1, 1], [1, 1, 0]], bool)
-    message = messages.depth_message(header(), depth, messages.valid_depth(depth, mask))
+    message = messages.depth_message(header(), depth, valid_depth(depth, mask))
     assert (message.height, message.width, message.step) == (2, 3, 12)
     assert (message.encoding, message.is_bigendian) == ("32FC1", 0)
     assert message.header == header()
@@ -271,7 +274,7 @@ def test_cloud_has_the_layout_of_pcl() -> None:
     points = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
     valid = np.array([[1, 1, 1], [1, 0, 1]], bool)
     image = np.arange(100, 118, dtype=np.uint8).reshape(2, 3, 3)
-    message = messages.cloud_message(header(), messages.pack_cloud(points, valid, image))
+    message = cloud_message(header(), pack_cloud(points, valid, image))
     assert (message.height, message.width) == (2, 3)
     assert (message.point_step, message.row_step) == (32, 96)
     assert (message.is_dense, message.is_bigendian) == (False, False)
@@ -291,32 +294,32 @@ def test_cloud_has_the_layout_of_pcl() -> None:
 
 def test_cloud_survives_the_round_trip_bit_for_bit() -> None:
     rng = np.random.default_rng(1)
-    cloud = messages.pack_cloud(
+    cloud = pack_cloud(
         rng.normal(size=(5, 7, 3)).astype(np.float32),
         rng.random((5, 7)) < 0.7,
         rng.integers(0, 256, (5, 7, 3)).astype(np.uint8),
     )
-    back = messages.cloud_points(messages.cloud_message(header(), cloud))
+    back = cloud_points(cloud_message(header(), cloud))
     assert back.tobytes() == cloud.tobytes()
 
 
 def test_clouds_of_another_layout_are_refused() -> None:
-    cloud = np.zeros((2, 2), messages.CLOUD_DTYPE)
-    other = messages.cloud_message(header(), cloud)
+    cloud = np.zeros((2, 2), CLOUD_DTYPE)
+    other = cloud_message(header(), cloud)
     other.fields[3].offset = 12
     with pytest.raises(MessageError, match="layout"):
-        messages.cloud_points(other)
-    short = messages.cloud_message(header(), cloud)
+        cloud_points(other)
+    short = cloud_message(header(), cloud)
     short.data = array.array("B", bytes(100))
     with pytest.raises(MessageError, match="100 bytes"):
-        messages.cloud_points(short)
+        cloud_points(short)
 
 
 def test_estimated_camera_info_says_the_same_in_k_and_p() -> None:
     matrix = np.array([[50.0, 0, 3], [0, 51, 4], [0, 0, 1]])
-    message = messages.camera_info_message(header(), matrix, 8, 10)
+    message = camera_info_message(header(), matrix, 8, 10)
     assert message.header == header()
     for rectified in (False, True):
-        got = messages.decode_camera_info(message, 8, 10, rectified=rectified)
+        got = decode_camera_info(message, 8, 10, rectified=rectified)
         assert np.array_equal(got.matrix, matrix)
         assert not got.distorted

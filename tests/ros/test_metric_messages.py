@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField, Range
 
 from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
-from dyfn_ros.messages import MessageError
-from dyfn_ros.metric_messages import (
+from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.references import (
     decode_points,
     decode_range,
     decode_scan,

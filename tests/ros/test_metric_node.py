@@ -28,7 +28,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from dyfn_ros import messages
+from dyfn_ros.messages import images as messages
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

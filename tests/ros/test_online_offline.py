@@ -16,12 +16,12 @@ import pytest
 from mcap.reader import make_reader
 from ros_graph import DEADLINE, own_domain
 
-from dyfn_ros.environment import prepare_environment
-from dyfn_ros.messages import decode_depth
-from dyfn_ros.node_process import NodeProcess
-from dyfn_ros.recordings import RecordedFrame, open_recording
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
-from dyfn_ros.rosbags_messages import IMAGE, TYPES
+from dyfn_ros.demo.node_process import NodeProcess
+from dyfn_ros.messages.images import decode_depth
+from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.recordings.open import RecordedFrame, open_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.typestore import IMAGE, TYPES
 
 COUNT, SIZE = 12, (240, 320)
 CAMERA = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
@@ -52,7 +52,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def offline(folder: Path) -> dict[str, Path]:
     """Recording -> folder of its results, by one command line."""
-    command = [sys.executable, "-m", "dyfn_ros.replay", str(folder / "walk"), str(folder / "rest")]
+    command = [
+        sys.executable,
+        "-m",
+        "dyfn_ros.replay.run",
+        str(folder / "walk"),
+        str(folder / "rest"),
+    ]
     options = ["--out", str(folder / "offline"), "--write", "mcap"]
     subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL, timeout=DEADLINE)
     return {name: folder / "offline" / name for name in ("walk", "rest")}
@@ -73,7 +79,7 @@ def online(folder: Path) -> Iterator[dict[str, list[bytes]]]:
     with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
         for name, value in domain.items():
             patch.setenv(name, value)
-        from dyfn_ros.live_player import LivePlayer
+        from dyfn_ros.demo.live_player import LivePlayer
 
         number = int(domain["ROS_DOMAIN_ID"])
         with (

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
-from dyfn_ros import parameter_docs
-from dyfn_ros.parameter_table import CONFIGURE, RUN, SPECS, START, Settings
-from dyfn_ros.parameters import check, check_cameras, usage
+from dyfn_ros.node.parameters import docs as parameter_docs
+from dyfn_ros.node.parameters.declare import check, check_cameras, usage
+from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, Settings
 
 ROOT = Path(__file__).parents[2]
 
@@ -47,7 +47,7 @@ def test_a_launch_file_compiles(path: Path) -> None:
 
 
 def test_manual_and_parameter_file_are_written_from_the_table() -> None:
-    """Run `python -m dyfn_ros.parameter_docs` after a change of the table."""
+    """Run `python -m dyfn_ros.node.parameters.docs` after a change of the table."""
     manual = (ROOT / "docs/node.md").read_text()
     assert parameter_docs.updated_manual(manual) == manual
     assert all(f"| `{name}`" in manual for name in SPECS)

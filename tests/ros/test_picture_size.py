@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_ros.compressed_depth import decode_compressed_depth
-from dyfn_ros.compressed_image import decode_compressed
-from dyfn_ros.encodings import MessageError
-from dyfn_ros.picture_size import MAX_PIXELS, PNG, check_picture_size
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.recordings import open_recording
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, compressed_message
+from dyfn_ros.messages.compressed_depth import decode_compressed_depth
+from dyfn_ros.messages.compressed_image import decode_compressed
+from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.picture_size import MAX_PIXELS, PNG, check_picture_size
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, compressed_message
+from dyfn_ros.recordings.writer import RecordingWriter
 
 
 def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from made_recordings import MAKERS, make, shade
 
-from dyfn_ros.recordings import RecordingError, open_recording
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.open import RecordingError, open_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
 
 COUNT = 5
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
-from dyfn_ros.rosbags_messages import IMAGE, TYPES, depth_to_millimetres, quaternion_from_matrix
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.typestore import IMAGE, TYPES, depth_to_millimetres, quaternion_from_matrix
+from dyfn_ros.recordings.writer import RecordingWriter
 
 CAMERA = np.array([[100.0, 0, 31.5], [0, 101.0, 23.5], [0, 0, 1]])
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.recordings import RecordedFrame, RecordingError, image_topics, open_recording
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
-from dyfn_ros.rosbags_messages import (
+from dyfn_ros.recordings.open import RecordedFrame, RecordingError, image_topics, open_recording
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.topics import Topics
+from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
@@ -20,7 +20,7 @@ from dyfn_ros.rosbags_messages import (
     compressed_message,
     image_message,
 )
-from dyfn_ros.topics import Topics
+from dyfn_ros.recordings.writer import RecordingWriter
 
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
 SIZE = (24, 32)

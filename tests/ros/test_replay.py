@@ -14,17 +14,19 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from tiny_model import load_tiny
 
-from dyfn_core.evaluation.controls import latent_controls, stabilized_by
-from dyfn_core.evaluation.model_method import as_array
-from dyfn_core.evaluation.protocols import SequenceScorer
+from dyfn_core.evaluation.benchmarks.model_method import as_array
 from dyfn_core.geometry.alignment import fit_scale_shift
-from dyfn_core.stream import DepthStream
-from dyfn_ros.messages import cloud_points, decode_depth
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.replay import ALL, PARTIAL, UNUSABLE, load, main, parse
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
-from dyfn_ros.rosbags_messages import IMAGE, TYPES
-from dyfn_ros.threads import THREADS
+from dyfn_core.models.controls import latent_controls, stabilized_by
+from dyfn_core.scoring.protocols import SequenceScorer
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_core.threads import THREADS
+from dyfn_ros.messages.clouds import cloud_points
+from dyfn_ros.messages.images import decode_depth
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.typestore import IMAGE, TYPES
+from dyfn_ros.recordings.writer import RecordingWriter
+from dyfn_ros.replay.cli import main
+from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, load, parse
 
 SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])

@@ -11,10 +11,12 @@ import pytest
 from test_replay_outputs import CAMERA, SIZE, WALL, camera_pose
 from tiny_model import load_tiny
 
-from dyfn_core.evaluation import protocols, worst_frames
+from dyfn_core.evaluation.report import worst_frames
 from dyfn_core.geometry import voxel_grid
-from dyfn_ros.replay import ALL, main
-from dyfn_ros.rgbd_recording import RgbdFrame, write_rgbd_recording
+from dyfn_core.scoring import protocols
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.replay.cli import main
+from dyfn_ros.replay.run import ALL
 
 SHORT, LONG = 30, 150  # frames
 ROUND = 10  # frames until the camera is where it was

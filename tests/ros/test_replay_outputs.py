@@ -17,17 +17,18 @@ from scipy.spatial.transform import Rotation
 from tiny_model import load_tiny
 
 from dyfn_core.geometry.voxel_grid import VoxelGrid
-from dyfn_ros.camera_stream import Geometry
-from dyfn_ros.poses import ODOMETRY, PoseError, open_poses
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.recordings import open_recording
-from dyfn_ros.replay import ALL, UNUSABLE, main
-from dyfn_ros.replay_outputs import FILES, OutputOptions, ReplayOutputs
-from dyfn_ros.replay_rerun import ROOM
-from dyfn_ros.replay_video import Alignment
-from dyfn_ros.rgbd_recording import RgbdFrame
-from dyfn_ros.rgbd_recording import write_rgbd_recording as record
-from dyfn_ros.rosbags_messages import TYPES, header
+from dyfn_core.stream.session import Geometry
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.poses import ODOMETRY, PoseError, open_poses
+from dyfn_ros.recordings.rgbd_writer import RgbdFrame
+from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording as record
+from dyfn_ros.recordings.typestore import TYPES, header
+from dyfn_ros.recordings.writer import RecordingWriter
+from dyfn_ros.replay.cli import main
+from dyfn_ros.replay.outputs import FILES, OutputOptions, ReplayOutputs
+from dyfn_ros.replay.rerun import ROOM
+from dyfn_ros.replay.run import ALL, UNUSABLE
+from dyfn_ros.replay.video import Alignment
 
 SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
@@ -66,7 +67,7 @@ def written(tmp_path: Path) -> Callable[..., list[str]]:
     """Plays a recording through ReplayOutputs with a perfect model; gives the warnings."""
 
     def write(frames: list[RgbdFrame], aligned: bool = True, **options: Any) -> list[str]:
-        from dyfn_core.evaluation.protocols import FrameScore
+        from dyfn_core.scoring.protocols import FrameScore
 
         record(tmp_path / "walk", frames, jpeg_quality=None, overwrite=True)
         (tmp_path / "out").mkdir(exist_ok=True)
@@ -156,7 +157,8 @@ def test_the_video_plays_at_the_pace_of_the_stamps(
 
 def test_flicker_is_seen_in_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same scene said 30 % farther is painted in another colour: the range does not follow."""
-    from dyfn_ros import frame_spool, replay_video
+    from dyfn_ros.replay import frame_spool
+    from dyfn_ros.replay import video as replay_video
 
     spool = frame_spool.FrameSpool(tmp_path)
     record(tmp_path / "walk", facing_a_wall(1, truth=False))
@@ -240,7 +242,7 @@ def test_a_full_disk_leaves_no_half_rerun_recording(
     pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
     room = iter([ROOM, ROOM, ROOM - 1])
     monkeypatch.setattr(
-        "dyfn_ros.replay_rerun.shutil.disk_usage", lambda _: SimpleNamespace(free=next(room))
+        "dyfn_ros.replay.rerun.shutil.disk_usage", lambda _: SimpleNamespace(free=next(room))
     )
     assert main([*noisy_walk(tmp_path), "--write", "rrd"], load_tiny) == UNUSABLE
     assert "output.rrd: cannot be written: 64 MB are free" in capsys.readouterr().err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dyfn_ros.statistics import FrameStatistics
+from dyfn_ros.node.statistics import FrameStatistics
 
 
 class Clock:

@@ -21,12 +21,12 @@ from made_recordings import (
     write_mcap,
 )
 
-from dyfn_ros.chunked_file import MAX_OPEN, Span, merged
-from dyfn_ros.recorded import MOST_LOSSES, Recorded, decompress
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.recordings import open_recording
-from dyfn_ros.rosbags_messages import IMAGE
-from dyfn_ros.storage import is_recording, open_storage
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.storage.base import MOST_LOSSES, Recorded, decompress
+from dyfn_ros.recordings.storage.chunked import MAX_OPEN, Span, merged
+from dyfn_ros.recordings.storage.open import is_recording, open_storage
+from dyfn_ros.recordings.typestore import IMAGE
 
 COUNT = 24
 
@@ -237,7 +237,7 @@ def bomb(size: int) -> bytes:
 def test_decompression_is_bounded(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import lz4.frame
 
-    monkeypatch.setattr("dyfn_ros.recorded.MAX_BYTES", 8 << 20)
+    monkeypatch.setattr("dyfn_ros.recordings.storage.base.MAX_BYTES", 8 << 20)
     data = bomb(64 << 20) if compression == "zstd" else lz4.frame.compress(bytes(64 << 20))
     with pytest.raises(OverflowError, match="come out of"):
         decompress(compression, data)

@@ -31,8 +31,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from test_picture_size import png
 from tiny_model import BLOCKING, FAILING, load_tiny
 
-from dyfn_core.stream import DepthStream
-from dyfn_ros import messages
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_ros.messages import images as messages
 
 
 class Graph:
@@ -478,7 +478,7 @@ def test_a_node_that_cannot_run_says_why_and_exits_with_one(
 def test_every_parameter_has_a_description(lossless: tuple[NodeProcess, Client]) -> None:
     from rcl_interfaces.srv import DescribeParameters
 
-    from dyfn_ros.parameter_table import SPECS, START
+    from dyfn_ros.node.parameters.table import SPECS, START
 
     client = lossless[1]
     service = client.node.create_client(DescribeParameters, f"{NODE}/describe_parameters")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tiny_model import load_tiny
 
-from dyfn_ros.camera_stream import CameraStream, StreamFrame, stream_maker
-from dyfn_ros.metric_scale import MetricHook
-from dyfn_ros.parameter_table import Settings
-from dyfn_ros.scene_cut import SceneCutHook
-from dyfn_ros.state_file import StateError, StateHook, path_for
+from dyfn_core.stream.scene_cut_hook import SceneCutHook
+from dyfn_core.stream.session import CameraStream, StreamFrame, stream_maker
+from dyfn_core.stream.state_hook import StateError, StateHook, path_for
+from dyfn_ros.node.metric_scale import MetricHook
+from dyfn_ros.node.parameters.table import Settings
 
 
 class Ports:

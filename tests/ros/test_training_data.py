@@ -19,8 +19,8 @@ from dyfn_core.data.datasets import data_kind, open_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec, open_pool
 from dyfn_core.models.checkpoints import load_model
-from dyfn_ros.recording_writer import RecordingWriter
-from dyfn_ros.rosbags_messages import COMPRESSED_IMAGE, compressed_message
+from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, compressed_message
+from dyfn_ros.recordings.writer import RecordingWriter
 
 SIZE = (48, 64)
 CAMERA = np.array([[50.0, 0, 30.5], [0, 52.0, 24.5], [0, 0, 1]])
@@ -168,7 +168,7 @@ def test_without_the_reading_libraries_the_error_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Broken:
-        name, value = "recording", "dyfn_ros.training_data:RECORDING"
+        name, value = "recording", "dyfn_ros.recordings.training_data:RECORDING"
 
         def load(self) -> object:
             raise ImportError("No module named 'rosbags'")

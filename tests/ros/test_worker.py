@@ -11,8 +11,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dyfn_core.geometry.camera import pixel_intrinsics
 from dyfn_core.prediction import Prediction
-from dyfn_ros.camera_stream import (
+from dyfn_core.stream.session import (
     BACKWARDS,
     FAILED,
     GAP,
@@ -26,10 +27,9 @@ from dyfn_ros.camera_stream import (
     StreamHook,
     StreamKey,
     TimeRules,
-    pixel_matrix,
 )
-from dyfn_ros.throttle import Throttle
-from dyfn_ros.worker import FrameWorker
+from dyfn_ros.node.log_throttle import Throttle
+from dyfn_ros.node.worker import FrameWorker
 
 DEADLINE = 20.0
 
@@ -326,7 +326,7 @@ def test_a_hook_can_start_the_stream_anew_and_scale_its_geometry() -> None:
 
 def test_normalised_and_pixel_intrinsics_project_to_the_same_place() -> None:
     intrinsics = np.array([[0.9, 0, 0.45], [0, 1.3, 0.52], [0, 0, 1]])
-    matrix = pixel_matrix(intrinsics, 48, 64)
+    matrix = pixel_intrinsics(intrinsics, (48, 64))
     ray = np.array([0.2, -0.1, 1.0])
     x, y, _ = intrinsics @ ray
     u, v, _ = matrix @ ray

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 
 FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
 BLOCKING = (9, 8, 7)  # this one makes it say so in the pipe $TINY_ENTERED and wait for $TINY_GO

@@ -7,8 +7,8 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from dyfn_ros import messages
-from dyfn_ros.stream_depth import main
+from dyfn_ros.messages import images as messages
+from dyfn_ros.node.main import main
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel

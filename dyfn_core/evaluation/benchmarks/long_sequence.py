@@ -11,7 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmark_run import (
+from dyfn_core.evaluation.benchmarks.predictions import Method
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
+from dyfn_core.evaluation.benchmarks.run import (
     Note,
     Scoring,
     VariantScorers,
@@ -19,12 +21,10 @@ from dyfn_core.evaluation.benchmark_run import (
     plain_settings,
     versions,
 )
-from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Opened
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.predictions import Method
-from dyfn_core.evaluation.protocols import SequenceScorer
-from dyfn_core.evaluation.report import Cell, Table
-from dyfn_core.evaluation.tables import write_tables
+from dyfn_core.evaluation.report.html import Cell, Table
+from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.evaluation.report.tables import write_tables
+from dyfn_core.scoring.protocols import SequenceScorer
 
 LENGTHS = (100, 200, 300, 400, 500)
 Point = dict[str, Any]

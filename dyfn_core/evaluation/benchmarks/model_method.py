@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.evaluation.controls import latent_controls, stabilized_by
-from dyfn_core.evaluation.predictions import Predict
+from dyfn_core.evaluation.benchmarks.predictions import Predict
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.stabilizer import Stabilizer
+from dyfn_core.models.controls import latent_controls, stabilized_by
+from dyfn_core.models.dyfn import Stabilizer
 from dyfn_core.prediction import DISPARITY, Prediction
-from dyfn_core.stream import DepthStream
+from dyfn_core.stream.depth_stream import DepthStream
 
 
 class ModelMethod:

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.evaluation.benchmarks import BenchmarkSequence
-from dyfn_core.evaluation.frame_scores import FrameScore
-from dyfn_core.evaluation.pictures import FrameStrip, Snapshot
-from dyfn_core.evaluation.protocols import SequenceScore
-from dyfn_core.evaluation.worst_frames import WIDTH, WorstFrames
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence
+from dyfn_core.evaluation.report.pictures import FrameStrip, Snapshot
+from dyfn_core.evaluation.report.worst_frames import WIDTH, WorstFrames
+from dyfn_core.scoring.frame_scores import FrameScore
+from dyfn_core.scoring.protocols import SequenceScore
 
 STRIPS = 12  # sequences that are shown, evenly spaced over the benchmark
 ROWS = 3  # frames of each

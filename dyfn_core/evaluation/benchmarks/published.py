@@ -30,7 +30,11 @@ class Published:
 @cache
 def published() -> tuple[Published, ...]:
     """All numbers, in the paper's order."""
-    data = files("dyfn_core.evaluation").joinpath("published.json").read_text(encoding="utf-8")
+    data = (
+        files("dyfn_core.evaluation.benchmarks")
+        .joinpath("published.json")
+        .read_text(encoding="utf-8")
+    )
     return tuple(Published(**row) for row in json.loads(data)["rows"])
 
 

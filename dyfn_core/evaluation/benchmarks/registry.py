@@ -10,7 +10,7 @@ from pathlib import Path
 
 from dyfn_core.data.datasets.files import nothing_found
 from dyfn_core.data.frames import DataError, DataReport
-from dyfn_core.evaluation.benchmarks import (
+from dyfn_core.evaluation.benchmarks.sets import (
     bonn,
     depthcrafter,
     kitti,
@@ -20,7 +20,7 @@ from dyfn_core.evaluation.benchmarks import (
     sintel,
     tum,
 )
-from dyfn_core.evaluation.benchmarks.base import (
+from dyfn_core.evaluation.benchmarks.sets.base import (
     UNREADABLE,
     Benchmark,
     BenchmarkFrame,

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.benchmark_pictures import STRIPS, BenchmarkPictures, WorstFrame
-from dyfn_core.evaluation.benchmark_table import sequence_table
-from dyfn_core.evaluation.report import (
+from dyfn_core.evaluation.benchmarks.pictures import STRIPS, BenchmarkPictures, WorstFrame
+from dyfn_core.evaluation.benchmarks.table import sequence_table
+from dyfn_core.evaluation.report.html import (
     Cell,
     Part,
     Picture,
@@ -19,7 +19,7 @@ from dyfn_core.evaluation.report import (
     Text,
     write_report,
 )
-from dyfn_core.evaluation.sequence_report import latency_section, over_time_curves
+from dyfn_core.evaluation.report.sequence import latency_section, over_time_curves
 
 NOTE = (
     "Image: each frame aligned to the truth by its own scale and shift; video: one scale and shift "

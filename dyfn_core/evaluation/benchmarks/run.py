@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmark_pictures import BenchmarkPictures, SequencePictures
-from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Opened
-from dyfn_core.evaluation.predictions import Method, Predict
-from dyfn_core.evaluation.protocols import (
+from dyfn_core.evaluation.benchmarks.pictures import BenchmarkPictures, SequencePictures
+from dyfn_core.evaluation.benchmarks.predictions import Method, Predict
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
+from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
+from dyfn_core.prediction import DEPTH
+from dyfn_core.scoring.protocols import (
     CONTROLS,
     L1,
     SequenceScore,
@@ -23,8 +25,6 @@ from dyfn_core.evaluation.protocols import (
     spread,
     to_shape,
 )
-from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
-from dyfn_core.prediction import DEPTH
 
 PROTOCOLS = ("image", "video", "metric")
 PACKAGES = ("dyfn_ros", "numpy", "torch", "opencv-python-headless")

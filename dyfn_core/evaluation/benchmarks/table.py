@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.evaluation.published import METHODS, PARTS, Published, published_rows
-from dyfn_core.evaluation.report import Cell, Table
-from dyfn_core.evaluation.tables import write_tables
+from dyfn_core.evaluation.benchmarks.published import METHODS, PARTS, Published, published_rows
+from dyfn_core.evaluation.report.html import Cell, Table
+from dyfn_core.evaluation.report.tables import write_tables
 
 SCORES = tuple((p, m) for p in ("image", "video", "metric") for m in ("abs_rel", "delta1"))
 HEADER = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyfn_core.evaluation.matching import MatchWindow, partners, sample_at
+from dyfn_core.evaluation.reconstruction.matching import MatchWindow, partners, sample_at
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.geometry.registration import (
     Consensus,

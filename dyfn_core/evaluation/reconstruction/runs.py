@@ -11,17 +11,17 @@ import numpy as np
 import torch
 
 from dyfn_core.data.frames import FrameError, FrameSequence, RgbdFrame
-from dyfn_core.evaluation.cloud_error import CloudError, cloud_error
-from dyfn_core.evaluation.cloud_pictures import draw_fused
-from dyfn_core.evaluation.matching import Matcher, MatchWindow
-from dyfn_core.evaluation.reconstruction import Reconstruction, ReconstructionOptions
-from dyfn_core.evaluation.report import Cell, Table
-from dyfn_core.evaluation.trajectory import TrajectoryError, trajectory_error
+from dyfn_core.evaluation.reconstruction.cloud_error import CloudError, cloud_error
+from dyfn_core.evaluation.reconstruction.cloud_pictures import draw_fused
+from dyfn_core.evaluation.reconstruction.matching import Matcher, MatchWindow
+from dyfn_core.evaluation.reconstruction.poses import Reconstruction, ReconstructionOptions
+from dyfn_core.evaluation.reconstruction.trajectory import TrajectoryError, trajectory_error
+from dyfn_core.evaluation.report.html import Cell, Table
 from dyfn_core.geometry.camera import depth_to_points, pixel_intrinsics
 from dyfn_core.geometry.registration import RegistrationError, Similarity
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.stream import DepthStream
+from dyfn_core.stream.depth_stream import DepthStream
 
 TRUE_DEPTH, WITH_DYFN, BASE = "true depth", "with DyFN", "base model"
 TRUE_VOXEL = 0.02  # metres, of the true cloud

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.evaluation.pictures import encode_picture
-from dyfn_core.evaluation.report_curves import (
+from dyfn_core.evaluation.report.curves import (
     Curves,
     Histogram,
     curves_html,
     histogram_html,
 )
-from dyfn_core.evaluation.report_style import SCRIPT, STYLE
+from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.evaluation.report.style import SCRIPT, STYLE
 
 Cell = str | float | int | None
 

@@ -11,8 +11,8 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dyfn_core.evaluation.protocols import align_depth
 from dyfn_core.prediction import DEPTH
+from dyfn_core.scoring.protocols import align_depth
 
 INVALID = (70, 70, 70)
 MAX_ERROR = 0.5  # relative error that the error map saturates at

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.report import (
+from dyfn_core.evaluation.report.html import (
     Cell,
     Curves,
     Histogram,

@@ -6,7 +6,7 @@ import csv
 import io
 from pathlib import Path
 
-from dyfn_core.evaluation.report import Cell, Table, format_cell
+from dyfn_core.evaluation.report.html import Cell, Table, format_cell
 
 _LATEX = str.maketrans(
     {

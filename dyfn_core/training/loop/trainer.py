@@ -12,25 +12,25 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dyfn_core.models.checkpoints import save_model
-from dyfn_core.training.checkpoint import (
+from dyfn_core.training.config import RunConfig
+from dyfn_core.training.loop.checkpoint import (
     STATE_FILE,
     DamagedCheckpointError,
     has_state,
     read_state,
     write_state,
 )
-from dyfn_core.training.config import RunConfig
-from dyfn_core.training.ema import Ema
-from dyfn_core.training.processes import Processes
-from dyfn_core.training.run_folder import RunFolder
-from dyfn_core.training.run_state import (
+from dyfn_core.training.loop.ema import Ema
+from dyfn_core.training.loop.processes import Processes
+from dyfn_core.training.loop.run_folder import RunFolder
+from dyfn_core.training.loop.run_state import (
     moments,
     random_state,
     restore_moments,
     restore_random_state,
 )
-from dyfn_core.training.signals import StopSignals
-from dyfn_core.training.task import Task
+from dyfn_core.training.loop.signals import StopSignals
+from dyfn_core.training.tasks.task import Task
 
 MODEL_FILE = "model.safetensors"
 BEST_FILE = "best.safetensors"

@@ -23,10 +23,10 @@ from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.efficientnet import Block, EfficientNetLite0
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
-from dyfn_core.training.pictures import picture_rows
-from dyfn_core.training.processes import full_precision, part_seed, share_of
-from dyfn_core.training.task import Task
-from dyfn_core.training.validation import Example, recording_examples, score, spread_examples
+from dyfn_core.training.loop.processes import full_precision, part_seed, share_of
+from dyfn_core.training.tasks.pictures import picture_rows
+from dyfn_core.training.tasks.task import Task
+from dyfn_core.training.tasks.validation import Example, recording_examples, score, spread_examples
 
 LOCAL_LEVELS = (1 / 4, 1 / 16)
 LARGEST_RAW = 4.0  # raw points beyond this are pulled back: the losses do not fix their scale

@@ -13,11 +13,11 @@ from dyfn_core.losses.scale_spread import spread
 from dyfn_core.losses.video_protocol import video_protocol_loss
 from dyfn_core.prediction import StreamState
 from dyfn_core.training.config import ConfigError, ScaleRunConfig
-from dyfn_core.training.latents import LatentClips
-from dyfn_core.training.processes import part_seed, share_of
-from dyfn_core.training.stabilizer import StabilizerTask
-from dyfn_core.training.summaries import SummaryCache, SummaryClips
-from dyfn_core.training.validation import Sequence
+from dyfn_core.training.loop.processes import part_seed, share_of
+from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.gru_input_cache import SummaryCache, SummaryClips
+from dyfn_core.training.tasks.latent_cache import LatentClips
+from dyfn_core.training.tasks.validation import Sequence
 
 
 class ScaleTask(StabilizerTask):

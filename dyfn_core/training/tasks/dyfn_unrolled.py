@@ -28,20 +28,16 @@ from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
 from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.stabilizer import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
 from dyfn_core.prediction import StreamState
-from dyfn_core.training.base import clip_source
+from dyfn_core.scoring.quick import known_mean, sequence_scores
 from dyfn_core.training.config import ConfigError, StabilizerRunConfig
-from dyfn_core.training.latents import LatentCache, LatentClips, encode_clips
-from dyfn_core.training.pictures import coloured_depth
-from dyfn_core.training.processes import full_precision, part_seed, share_of
-from dyfn_core.training.task import Task
-from dyfn_core.training.validation import (
-    Sequence,
-    known_mean,
-    recording_examples,
-    sequence_scores,
-)
+from dyfn_core.training.loop.processes import full_precision, part_seed, share_of
+from dyfn_core.training.tasks.base import clip_source
+from dyfn_core.training.tasks.latent_cache import LatentCache, LatentClips, encode_clips
+from dyfn_core.training.tasks.pictures import coloured_depth
+from dyfn_core.training.tasks.task import Task
+from dyfn_core.training.tasks.validation import Sequence, recording_examples
 
 logger = logging.getLogger(__name__)
 VALIDATION_SEED = 1_000_000_007

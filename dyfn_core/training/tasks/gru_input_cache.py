@@ -19,7 +19,7 @@ from torch import Tensor
 from dyfn_core.data.clips import ClipBatch, ClipSource
 from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent
 from dyfn_core.training.config import ConfigError
-from dyfn_core.training.latents import CacheFolder, encode_clips, fingerprint
+from dyfn_core.training.tasks.latent_cache import CacheFolder, encode_clips, fingerprint
 
 FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
 TOGETHER = 8  # frames whose decoder is differentiated at once

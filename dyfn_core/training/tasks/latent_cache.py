@@ -17,9 +17,9 @@ from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.training.checkpoint import write_text
 from dyfn_core.training.config import ConfigError
-from dyfn_core.training.processes import own_place, wait_for_every_process
+from dyfn_core.training.loop.checkpoint import write_text
+from dyfn_core.training.loop.processes import own_place, wait_for_every_process
 
 META = "cache.json"
 

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
-from dyfn_ros.parameter_table import CONFIGURE, LIMITS, SPECS, START, Settings, Spec, show
+from dyfn_ros.node.parameters.table import CONFIGURE, LIMITS, SPECS, START, Settings, Spec, show
 
 _CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 

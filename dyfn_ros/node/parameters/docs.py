@@ -1,4 +1,4 @@
-"""`python -m dyfn_ros.parameter_docs`: write the parameter table into the manual and its file."""
+"""`python -m dyfn_ros.node.parameters.docs`: the parameter table as the manual and its file."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 from textwrap import wrap
 
-from dyfn_ros.parameter_table import CONFIGURE, MARKS, RUN, START, Spec, groups, show
+from dyfn_ros.node.parameters.table import CONFIGURE, MARKS, RUN, START, Spec, groups, show
 
-BEGIN = "<!-- parameters: written by `python -m dyfn_ros.parameter_docs` -->"
+BEGIN = "<!-- parameters: written by `python -m dyfn_ros.node.parameters.docs` -->"
 END = "<!-- end of parameters -->"
 MANUAL, PARAMETER_FILE = Path("docs/node.md"), Path("config/stream_depth.yaml")
 _WHEN = {START: "fixed at start", CONFIGURE: "while unconfigured", RUN: "at any time"}
@@ -40,8 +40,9 @@ def parameter_file() -> str:
     """YAML: every parameter with its default and a comment."""
     lines = [
         "# Parameters of the node `stream_depth`, with their defaults; written by",
-        "# `python -m dyfn_ros.parameter_docs`. A named camera may have its own: `front.min_depth`",
-        "# for those marked (camera). stream_depth --ros-args --params-file stream_depth.yaml",
+        "# `python -m dyfn_ros.node.parameters.docs`. A named camera may have its own:",
+        "# `front.min_depth` for those marked (camera).",
+        "# stream_depth --ros-args --params-file stream_depth.yaml",
         "/**/stream_depth:",
         "  ros__parameters:",
     ]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dyfn_ros.parameter_spec import RUN
-from dyfn_ros.parameter_spec import parameter as _parameter
+from dyfn_ros.node.parameters.spec import RUN
+from dyfn_ros.node.parameters.spec import parameter as _parameter
 
 SCALE = "Metric scale"
 

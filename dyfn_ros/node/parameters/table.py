@@ -7,10 +7,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
-from dyfn_ros.metric_parameters import SCALE, MetricSettings
-from dyfn_ros.parameter_spec import CONFIGURE, MARKS, RUN, START, Spec
-from dyfn_ros.parameter_spec import parameter as _parameter
-from dyfn_ros.threads import THREADS
+from dyfn_core.threads import THREADS
+from dyfn_ros.node.parameters.metric import SCALE, MetricSettings
+from dyfn_ros.node.parameters.spec import CONFIGURE, MARKS, RUN, START, Spec
+from dyfn_ros.node.parameters.spec import parameter as _parameter
 
 __all__ = [
     "CONFIGURE",

@@ -16,8 +16,8 @@ from mcap.exceptions import McapError
 from rosbags.rosbag1 import ReaderError as Bag1Error
 from rosbags.serde import SerdeError
 
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.rosbags_messages import TYPES
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.typestore import TYPES
 
 # What the readers are known to raise on bytes that are no longer what was written.
 DAMAGE = (

@@ -9,7 +9,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from dyfn_ros.recorded import DAMAGE, MAX_BYTES, Losses, Recorded, Topic, count_topics, reason
+from dyfn_ros.recordings.storage.base import (
+    DAMAGE,
+    MAX_BYTES,
+    Losses,
+    Recorded,
+    Topic,
+    count_topics,
+    reason,
+)
 
 MAX_OPEN = 16  # chunks that overlap in time and are held at once
 

@@ -25,8 +25,17 @@ from mcap.records import (
     Statistics,
 )
 
-from dyfn_ros.chunked_file import ChunkedFile, Index, Span, read_exactly
-from dyfn_ros.recorded import DAMAGE, MAX_BYTES, Losses, Recorded, Topic, decompress, plain, reason
+from dyfn_ros.recordings.storage.base import (
+    DAMAGE,
+    MAX_BYTES,
+    Losses,
+    Recorded,
+    Topic,
+    decompress,
+    plain,
+    reason,
+)
+from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record

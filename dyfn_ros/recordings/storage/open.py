@@ -11,11 +11,11 @@ from pathlib import Path, PurePath
 import yaml
 import zstandard
 
-from dyfn_ros.bag1_file import Bag1File
-from dyfn_ros.mcap_file import McapFile
-from dyfn_ros.recorded import DAMAGE, Recorded, Storage, Topic, reason
-from dyfn_ros.recording_error import RecordingError
-from dyfn_ros.sqlite_file import SqliteFile
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.storage.base import DAMAGE, Recorded, Storage, Topic, reason
+from dyfn_ros.recordings.storage.mcap import McapFile
+from dyfn_ros.recordings.storage.rosbag1 import Bag1File
+from dyfn_ros.recordings.storage.sqlite import SqliteFile
 
 __all__ = ["SUFFIXES", "Recorded", "Storage", "Topic", "is_recording", "open_storage"]
 

@@ -15,9 +15,17 @@ from typing import BinaryIO
 from rosbags.rosbag1.reader import Header, RecordType, normalize
 from rosbags.typesys.msg import normalize_msgtype
 
-from dyfn_ros.chunked_file import ChunkedFile, Index, Span, read_exactly
-from dyfn_ros.recorded import DAMAGE, MAX_BYTES, Losses, Recorded, Topic, decompress, reason
-from dyfn_ros.rosbags_messages import TYPES
+from dyfn_ros.recordings.storage.base import (
+    DAMAGE,
+    MAX_BYTES,
+    Losses,
+    Recorded,
+    Topic,
+    decompress,
+    reason,
+)
+from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
+from dyfn_ros.recordings.typestore import TYPES
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER = 1 << 20  # a connection's header holds its message definition

@@ -8,7 +8,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from dyfn_ros.recorded import DAMAGE, Losses, Recorded, Topic, count_topics, plain, reason
+from dyfn_ros.recordings.storage.base import (
+    DAMAGE,
+    Losses,
+    Recorded,
+    Topic,
+    count_topics,
+    plain,
+    reason,
+)
 
 _LAST = (1 << 63) - 1
 

@@ -16,21 +16,21 @@ import torch
 from made_benchmarks import PATCH, depth, make_scannet, make_sintel, make_tum, make_video
 
 from dyfn_core.cli import eval as cli
-from dyfn_core.evaluation.benchmark_pictures import STRIPS, WORST, BenchmarkPictures
-from dyfn_core.evaluation.benchmark_run import Scoring, evaluate, mean_of
-from dyfn_core.evaluation.benchmark_table import HEADER
-from dyfn_core.evaluation.benchmarks import BenchmarkSequence, Settings, open_benchmark
-from dyfn_core.evaluation.controls import ema_control, frozen_control, stabilized_by
-from dyfn_core.evaluation.long_sequence import length_table, long_sequences
-from dyfn_core.evaluation.model_method import ModelMethod, as_array
-from dyfn_core.evaluation.predictions import ArrayMethod
-from dyfn_core.evaluation.protocols import LEAST_SQUARES, SequenceScorer, least_squares
-from dyfn_core.evaluation.published import published, published_rows
-from dyfn_core.evaluation.report import Table
-from dyfn_core.evaluation.tables import csv_table, latex_table, markdown_table
-from dyfn_core.evaluation.worst_frames import WIDTH
+from dyfn_core.evaluation.benchmarks.long_sequence import length_table, long_sequences
+from dyfn_core.evaluation.benchmarks.model_method import ModelMethod, as_array
+from dyfn_core.evaluation.benchmarks.pictures import STRIPS, WORST, BenchmarkPictures
+from dyfn_core.evaluation.benchmarks.predictions import ArrayMethod
+from dyfn_core.evaluation.benchmarks.published import published, published_rows
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Settings, open_benchmark
+from dyfn_core.evaluation.benchmarks.run import Scoring, evaluate, mean_of
+from dyfn_core.evaluation.benchmarks.table import HEADER
+from dyfn_core.evaluation.report.html import Table
+from dyfn_core.evaluation.report.tables import csv_table, latex_table, markdown_table
+from dyfn_core.evaluation.report.worst_frames import WIDTH
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.stream import DepthStream
+from dyfn_core.models.controls import ema_control, frozen_control, stabilized_by
+from dyfn_core.scoring.protocols import LEAST_SQUARES, SequenceScorer, least_squares
+from dyfn_core.stream.depth_stream import DepthStream
 
 TUM = (24, 32)
 

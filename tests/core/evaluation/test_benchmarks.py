@@ -30,7 +30,7 @@ from made_benchmarks import (
 )
 
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmarks import (
+from dyfn_core.evaluation.benchmarks.registry import (
     BENCHMARKS,
     BenchmarkFrame,
     BenchmarkSequence,

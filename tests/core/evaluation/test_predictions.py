@@ -11,9 +11,9 @@ import OpenEXR
 import pytest
 
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmarks import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.evaluation.benchmarks.base import Source
-from dyfn_core.evaluation.predictions import ArrayMethod, PredictionFolder
+from dyfn_core.evaluation.benchmarks.predictions import ArrayMethod, PredictionFolder
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkFrame, BenchmarkSequence
+from dyfn_core.evaluation.benchmarks.sets.base import Source
 
 SIZE = (6, 8)
 ALL = [depth.astype(np.float32) for depth in np.random.default_rng(0).uniform(1, 5, (6, *SIZE))]

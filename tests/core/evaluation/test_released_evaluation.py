@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import torch
 
-from dyfn_core.evaluation.metrics import depth_metrics, mean_metrics
-from dyfn_core.evaluation.protocols import (
+from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.losses.resample import nearest_valid
+from dyfn_core.scoring.metrics import depth_metrics, mean_metrics
+from dyfn_core.scoring.protocols import (
     ALL_PIXELS,
     LEAST_SQUARES,
     SequenceScorer,
     least_squares,
 )
-from dyfn_core.geometry.alignment import fit_scale_shift
-from dyfn_core.losses.resample import nearest_valid
 
 CLIPS = {"scannet": ("a", 10), "KITTI": ("b", 80), "sintel": ("c", 70), "bonn": ("d", 10)}
 NAMES = {

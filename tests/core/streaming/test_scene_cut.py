@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_core.streaming.scene_cut import SceneCutDetector, look_at, scene_difference
+from dyfn_core.stream.scene_cut import SceneCutDetector, look_at, scene_difference
 
 
 def scene(seed: int, width: int = 480, height: int = 240) -> np.ndarray:

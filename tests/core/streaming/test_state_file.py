@@ -20,10 +20,10 @@ from dyfn_core.metric.calibration import Calibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
 from dyfn_core.models.moge import MoGeModel
-from dyfn_core.stream import DepthStream
-from dyfn_core.streaming.plain_values import PlainError, from_plain, to_plain
-from dyfn_core.streaming.scene_cut import SceneCutDetector
-from dyfn_core.streaming.state_file import (
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
+from dyfn_core.stream.scene_cut import SceneCutDetector
+from dyfn_core.stream.state_file import (
     SavedStream,
     StateFileError,
     load_stream,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dyfn_core.data.worlds.furniture import Showroom, read_library
+from dyfn_worlds.rooms.furniture import Showroom, read_library
 
 CATALOGUE = """id=Made
 name#1=Small table

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from small_camera import SIZE
 
-from dyfn_core.data.worlds import md3
-from dyfn_core.data.worlds.actors import Actor, Moment, Placement, stiff_actor
-from dyfn_core.data.worlds.cameras import FreeSpace, pose_at
-from dyfn_core.data.worlds.generate import Job, RoomWorlds, render
-from dyfn_core.data.worlds.occlusion import occlusion
-from dyfn_core.data.worlds.paths import CameraPath
-from dyfn_core.data.worlds.renderer import Camera, Renderer
-from dyfn_core.data.worlds.scene import SceneBuilder, new_vertices
-from dyfn_core.data.worlds.staging import LightScript, Way, stand
+from dyfn_worlds.camera.cameras import FreeSpace, pose_at
+from dyfn_worlds.camera.paths import CameraPath
+from dyfn_worlds.camera.staging import LightScript, Way, stand
+from dyfn_worlds.generate import Job, RoomWorlds, render
+from dyfn_worlds.maps import md3
+from dyfn_worlds.render.occlusion import occlusion
+from dyfn_worlds.render.renderer import Camera, Renderer
+from dyfn_worlds.scene.actors import Actor, Moment, Placement
+from dyfn_worlds.scene.builder import SceneBuilder, new_vertices, stiff_actor
 
 
 def box_actor(builder: SceneBuilder) -> Actor:
@@ -97,8 +97,8 @@ def test_a_plane_has_no_corner_and_a_crease_has_one() -> None:
 
 
 def test_speeds_of_a_path_are_per_second() -> None:
-    from dyfn_core.data.worlds.cameras import Lens
-    from dyfn_core.data.worlds.paths import RATE
+    from dyfn_worlds.camera.cameras import Lens
+    from dyfn_worlds.camera.paths import RATE
 
     t = np.arange(121)[:, None] / RATE
     path = CameraPath(t * [0.5, 0, 0], t * [0.4, 0, 0], Lens((0.8, 1.0)))

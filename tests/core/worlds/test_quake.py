@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_core.data.worlds import quake
+from dyfn_worlds.maps import quake
 
 
 def png(color: tuple[int, int, int]) -> bytes:

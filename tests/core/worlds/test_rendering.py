@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from small_camera import SIZE, rays
 
-from dyfn_core.data.worlds.cameras import CLEARANCE, FreeSpace, Lens, pose_at
-from dyfn_core.data.worlds.generate import Job, RoomWorlds, render
-from dyfn_core.data.worlds.paths import random_path
-from dyfn_core.data.worlds.renderer import Camera, Renderer
-from dyfn_core.data.worlds.rooms import furnished_room
-from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder
-from dyfn_core.data.worlds.shards import DEPTH_INFINITE, View, encode_depth, write_shard
+from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
+from dyfn_worlds.camera.paths import random_path
+from dyfn_worlds.generate import Job, RoomWorlds, render
+from dyfn_worlds.render.renderer import Camera, Renderer
+from dyfn_worlds.rooms.rooms import furnished_room
+from dyfn_worlds.scene.builder import SceneBuilder
+from dyfn_worlds.scene.scene import Light, Scene
+from dyfn_worlds.shards import DEPTH_INFINITE, View, encode_depth, write_shard
 
 
 @pytest.fixture(scope="module")

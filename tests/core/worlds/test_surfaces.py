@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from small_camera import rays
 
-from dyfn_core.data.worlds import textures
-from dyfn_core.data.worlds.actors import STILL
-from dyfn_core.data.worlds.cameras import pose_at
-from dyfn_core.data.worlds.palette import Palette
-from dyfn_core.data.worlds.photographer import Photographer
-from dyfn_core.data.worlds.renderer import Camera, Look, Picture, Renderer
-from dyfn_core.data.worlds.scene import Light, Scene, SceneBuilder, Window
+from dyfn_worlds.camera.cameras import pose_at
+from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.render.renderer import Camera, Look, Picture, Renderer
+from dyfn_worlds.scene import textures
+from dyfn_worlds.scene.actors import STILL
+from dyfn_worlds.scene.builder import SceneBuilder
+from dyfn_worlds.scene.palette import Palette
+from dyfn_worlds.scene.scene import Light, Scene, Window
 
 DOWN = Camera(pose_at(np.array([2.0, 2.0, 2.5]), 0.0, -np.pi / 2, 0.0), (0.5, 0.5 * 4 / 3))
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from dyfn_core.data.datasets.rgbd_folder import TUM_CAMERAS
 from dyfn_core.data.frames import DataReport
-from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, Settings, Source
-from dyfn_core.evaluation.benchmarks.rgbd import rgbd_sources
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source
+from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
 EXPECTED = (
     "rgbd_bonn_<name>/ with rgb.txt, depth.txt, rgb/<stamp>.png, depth/<stamp>.png "

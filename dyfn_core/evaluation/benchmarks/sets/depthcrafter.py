@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from dyfn_core.data.frames import DataReport, FrameError
-from dyfn_core.evaluation.arrays import frames_of_array, npz_key
-from dyfn_core.evaluation.benchmarks.base import UNREADABLE, BenchmarkFrame, Source
+from dyfn_core.evaluation.benchmarks.arrays import frames_of_array, npz_key
+from dyfn_core.evaluation.benchmarks.sets.base import UNREADABLE, BenchmarkFrame, Source
 
 EXPECTED = (
     "<set>/<sequence>_rgb_left.mp4 and <set>/<sequence>_disparity.npz, whose key `disparity` "

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyfn_core.data.datasets.files import folders_holding, numbered_files, read_colour, read_uint16
 from dyfn_core.data.frames import DataReport, FrameError
-from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, Settings, Source, one_by_one
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
 
 EXPECTED = (
     "[val/]<drive>/proj_depth/groundtruth/image_02/0000000005.png and, in the root or raw/, "

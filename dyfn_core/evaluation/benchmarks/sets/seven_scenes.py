@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
-from dyfn_core.evaluation.benchmarks.base import Settings, Source
-from dyfn_core.evaluation.benchmarks.rgbd import rgbd_sources
+from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
+from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
 EXPECTED = "<scene>/seq-01/ with frame-000000.color.png, .depth.png and .pose.txt"
 SETTINGS = Settings(depth_max=10)

@@ -10,7 +10,7 @@ import numpy as np
 from dyfn_core.data.datasets.axes import inverse
 from dyfn_core.data.datasets.files import numbered_files, read_colour, with_depth
 from dyfn_core.data.frames import DataReport, FrameError
-from dyfn_core.evaluation.benchmarks.base import BenchmarkFrame, Settings, Source, one_by_one
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
 
 EXPECTED = (
     "training/{clean,final}/<sequence>/frame_0001.png and "

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
-from dyfn_core.evaluation.benchmarks.base import Settings, Source
-from dyfn_core.evaluation.benchmarks.rgbd import rgbd_sources
+from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
+from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
 EXPECTED = (
     "rgbd_dataset_freiburg<N>_<name>/ with rgb.txt, depth.txt, groundtruth.txt, rgb/<stamp>.png "

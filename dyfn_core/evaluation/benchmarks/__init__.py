@@ -1,0 +1,1 @@
+"""The public benchmarks of video depth: data sets, runs, tables."""

@@ -1,0 +1,1 @@
+"""One module for each benchmark: its layout, frames, crops and caps."""

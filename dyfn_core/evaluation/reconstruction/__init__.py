@@ -1,0 +1,1 @@
+"""Reconstruction from predicted depth: matches, registered poses, clouds, their errors."""

@@ -1,0 +1,1 @@
+"""HTML reports of an evaluation: tables, curves, pictures."""

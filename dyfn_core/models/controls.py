@@ -1,0 +1,69 @@
+"""What a learned DyFN is compared with: the latent's own statistics, averaged or frozen."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.dyfn import EPSILON, Stabilizer, StabilizerConfig
+from dyfn_core.prediction import StreamState
+
+EMA_ALPHA = 0.1
+
+
+class StatisticsControl(Stabilizer):
+    """Replaces the latent's statistics by a moving average of themselves; nothing is learned.
+
+    alpha: weight of the present frame; 0 keeps the first frame's statistics, 1 changes nothing.
+    """
+
+    def __init__(self, channels: int, alpha: float) -> None:
+        super().__init__(channels, StabilizerConfig())
+        if not 0 <= alpha <= 1:
+            raise ValueError(f"alpha must be in 0..1, got {alpha}")
+        self.alpha = alpha
+
+    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+        return mean
+
+    def _step(
+        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+    ) -> tuple[Tensor, Tensor, StreamState]:
+        if state is not None and state.ema_mean is not None and state.ema_std is not None:
+            mean = torch.lerp(state.ema_mean, mean, self.alpha)
+            std = torch.lerp(state.ema_std, std, self.alpha)
+        return std + EPSILON, mean, StreamState(mean, mean, std)
+
+
+def ema_control(channels: int) -> StatisticsControl:
+    """Moving average of mean and deviation, alpha 0.1."""
+    return StatisticsControl(channels, EMA_ALPHA)
+
+
+def frozen_control(channels: int) -> StatisticsControl:
+    """Mean and deviation of the first frame for the whole stream."""
+    return StatisticsControl(channels, 0.0)
+
+
+def latent_controls(model: GeometryModel) -> dict[str, Stabilizer]:
+    """What the model's own stabilizer is compared with, by name, on the model's device."""
+    channels = model.latent_channels
+    return {
+        "ema": ema_control(channels).to(model.device),
+        "frozen": frozen_control(channels).to(model.device),
+    }
+
+
+@contextlib.contextmanager
+def stabilized_by(model: GeometryModel, stabilizer: Stabilizer | None) -> Iterator[GeometryModel]:
+    """Inside, the model has this stabilizer (or none); afterwards its own again."""
+    own = model.stabilizer
+    model.stabilizer = stabilizer
+    try:
+        yield model
+    finally:
+        model.stabilizer = own

@@ -1,0 +1,1 @@
+"""Metrics and protocols (image, video, metric): used by training and evaluation alike."""

@@ -1,0 +1,1 @@
+"""What is trained: the base, and DyFN (unrolled or linearized)."""

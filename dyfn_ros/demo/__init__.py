@@ -1,0 +1,1 @@
+"""dyfn-demo: a recording played through the live node, and scored."""

@@ -1,0 +1,1 @@
+"""ROS messages to arrays and back; imports no other room."""

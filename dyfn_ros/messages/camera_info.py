@@ -1,0 +1,93 @@
+"""sensor_msgs/CameraInfo to intrinsics and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dyfn_ros.messages.encodings import MessageError
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What a CameraInfo says about one image.
+
+    matrix: 3 x 3 float64, pixels of the image at hand (binning and region of interest applied).
+    model: name of the lens model. d: its coefficients; empty for rectified images.
+    """
+
+    matrix: np.ndarray
+    model: str = ""
+    d: tuple[float, ...] = ()
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens model is more than a pinhole."""
+        return any(self.d)
+
+
+def _window(info: Any) -> tuple[int, int, int, int]:
+    """x, y, width, height of the image on the full sensor, before binning."""
+    roi = info.roi
+    if roi.width and roi.height:
+        return int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    return 0, 0, int(info.width), int(info.height)
+
+
+def decode_camera_info(
+    info: Any, height: int, width: int, *, rectified: bool = False
+) -> Calibration:
+    """sensor_msgs/CameraInfo -> the intrinsics of an image of height x width pixels.
+
+    rectified: take P, which describes rectified images, instead of K.
+    Raises MessageError: uncalibrated (K[0] == 0), no pinhole matrix, another size than the image.
+    """
+    k = _field(info, "k")
+    matrix = np.array(k, np.float64).reshape(3, 3)
+    if rectified:
+        matrix = np.array(_field(info, "p"), np.float64).reshape(3, 4)[:, :3].copy()
+    if matrix[0, 0] == 0:
+        raise MessageError(f"uncalibrated: {'P' if rectified else 'K'}[0] is 0")
+    pinhole = [[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]]
+    usable = np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0
+    if not usable or not np.array_equal(matrix, pinhole):
+        raise MessageError(f"no pinhole camera matrix [fx 0 cx; 0 fy cy; 0 0 1]: {matrix.tolist()}")
+    x, y, w, h = _window(info)
+    bin_x, bin_y = max(int(info.binning_x), 1), max(int(info.binning_y), 1)
+    if (h // bin_y, w // bin_x) != (height, width):
+        raise MessageError(
+            f"is for {w // bin_x} x {h // bin_y} pixels, but the images have {width} x {height}"
+        )
+    matrix[0, 2] = (matrix[0, 2] - x + 0.5) / bin_x - 0.5
+    matrix[1, 2] = (matrix[1, 2] - y + 0.5) / bin_y - 0.5
+    matrix[0, :2] /= bin_x
+    matrix[1, 1] /= bin_y
+    d = () if rectified else tuple(float(value) for value in _field(info, "d"))
+    return Calibration(matrix, str(info.distortion_model), d)
+
+
+def _field(info: Any, name: str) -> Any:
+    """ROS 2 says k and p, ROS 1 recordings say K and P."""
+    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
+
+
+def camera_info_message(header: Any, matrix: np.ndarray, height: int, width: int) -> Any:
+    """A pinhole camera of height x width pixels -> sensor_msgs.msg.CameraInfo.
+
+    matrix: 3 x 3, pixels.
+    """
+    from sensor_msgs.msg import CameraInfo
+
+    k = np.asarray(matrix, np.float64)
+    return CameraInfo(
+        header=header,
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=[0.0] * 5,
+        k=k.reshape(-1).tolist(),
+        r=np.eye(3).reshape(-1).tolist(),
+        p=np.column_stack([k, np.zeros(3)]).reshape(-1).tolist(),
+    )

@@ -1,0 +1,1 @@
+"""The lifecycle node; the only room, with demo, that knows rclpy."""

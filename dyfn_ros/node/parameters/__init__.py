@@ -1,0 +1,1 @@
+"""The node's parameters: one table, declared, checked and documented from it."""

@@ -1,0 +1,1 @@
+"""dyfn-record: recordings made of RGB-D folders and videos."""

@@ -1,0 +1,1 @@
+"""dyfn-replay: a recording through the stream session, its scores and outputs."""

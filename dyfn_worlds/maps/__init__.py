@@ -1,0 +1,1 @@
+"""Quake 3 maps and models as scenes."""

@@ -1,0 +1,1 @@
+"""OpenGL: pictures and depth of a scene."""
