@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.render.renderer import Renderer
 from dyfn_worlds.rooms.furniture import Showroom
 from dyfn_worlds.rooms.rooms import furnished_room
-from dyfn_worlds.shards import View
+from dyfn_worlds.shards import RenderedView
 
 LIBRARY = "BlendSwap-CC-0.sh3f"
 SIZE = (240, 320)
@@ -27,7 +27,7 @@ FPS = 15.0
 FIRST_STAMP = 1_700_000_000.0
 
 
-def render(assets: Path, seed: int, count: int) -> list[View]:
+def render(assets: Path, seed: int, count: int) -> list[RenderedView]:
     """The demo's views. Raises FileNotFoundError when the furniture library is not there."""
     library = next(iter(sorted(assets.rglob(LIBRARY))), None)
     if library is None:
@@ -37,7 +37,7 @@ def render(assets: Path, seed: int, count: int) -> list[View]:
     return Photographer(Renderer(SIZE), scene, rng).clip(count, count / FPS)
 
 
-def frames(views: list[View]) -> Iterator[RgbdFrame]:
+def frames(views: list[RenderedView]) -> Iterator[FrameToRecord]:
     height, width = SIZE
     for index, view in enumerate(views):
         (fx, fy), (cx, cy) = view.camera.focal, view.camera.centre
@@ -46,7 +46,7 @@ def frames(views: list[View]) -> Iterator[RgbdFrame]:
             [[fx * width, 0, cx * width - 0.5], [0, fy * height, cy * height - 0.5], [0, 0, 1]]
         )
         stamp = FIRST_STAMP + index / FPS
-        yield RgbdFrame(view.image, view.depth, matrix, view.camera.pose, stamp)
+        yield FrameToRecord(view.image, view.depth, matrix, view.camera.pose, stamp)
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 
 LENGTHS = (1, 4)  # times --frames
 ROUND = 120  # frames in which the camera is where it was
@@ -40,7 +40,7 @@ sys.exit(code)
 """
 
 
-def room(count: int, size: tuple[int, int]) -> Iterator[RgbdFrame]:
+def room(count: int, size: tuple[int, int]) -> Iterator[FrameToRecord]:
     """A textured box seen from inside by a camera that turns and sways; exact depth in metres."""
     height, width = size
     focal = 0.8 * width
@@ -60,7 +60,7 @@ def room(count: int, size: tuple[int, int]) -> Iterator[RgbdFrame]:
         hit = pose[:3, 3] + turned * depth[..., None]
         waves = np.sin(hit * [7, 9, 5])[..., [1, 2, 0]] + np.sin(hit * [17, 13, 19] + [1, 2, 3])
         image = np.clip(127 + 60 * waves, 0, 255).astype(np.uint8)
-        yield RgbdFrame(image, depth.astype(np.float32), matrix, pose, 100 + index / 30)
+        yield FrameToRecord(image, depth.astype(np.float32), matrix, pose, 100 + index / 30)
 
 
 def replay(recording: Path, out: Path, options: list[str]) -> dict[str, float]:

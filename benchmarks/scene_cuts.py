@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from dyfn_core.stream.scene_cut import (
     SceneCutDetector,
     colour_difference,
-    look_at,
+    picture_features,
     scene_difference,
     structure_difference,
 )
@@ -130,7 +130,10 @@ class Cases:
 
 def scores(cases: dict[str, list[Pair]]) -> dict[str, dict[str, np.ndarray]]:
     """Difference by candidate and kind; a pair that cannot be compared is no cut: -1."""
-    looks = {kind: [(look_at(a), look_at(b)) for a, b in pairs] for kind, pairs in cases.items()}
+    looks = {
+        kind: [(picture_features(a), picture_features(b)) for a, b in pairs]
+        for kind, pairs in cases.items()
+    }
     return {
         name: {
             kind: np.nan_to_num(np.array([score(*pair) for pair in pairs]), nan=-1.0)

@@ -29,7 +29,7 @@ from dyfn_core.models.moge import MoGeModel
 from dyfn_ros.demo.node_process import NodeProcess
 from dyfn_ros.node.environment import prepare_environment
 from dyfn_ros.recordings.open import open_recording
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 
 SIZES = {"320x240": (240, 320), "640x480": (480, 640)}
 BASELINE_TOKENS = 392  # of 14 x 14 pixels: 320 x 240 in the network
@@ -72,9 +72,9 @@ def node_milliseconds(name: str, frames: list[np.ndarray], folder: Path) -> list
     height, width = frames[0].shape[:2]
     matrix = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]])
 
-    def made() -> Iterator[RgbdFrame]:
+    def made() -> Iterator[FrameToRecord]:
         for index, frame in enumerate(frames):
-            yield RgbdFrame(frame, None, matrix, None, 1000.0 + index / 15)
+            yield FrameToRecord(frame, None, matrix, None, 1000.0 + index / 15)
 
     path = folder / f"raw_{width}"
     write_rgbd_recording(path, made(), jpeg_quality=None)

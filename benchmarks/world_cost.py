@@ -17,7 +17,7 @@ from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.camera.staging import stand
 from dyfn_worlds.generate import RoomWorlds
 from dyfn_worlds.render.occlusion import shade_corners
-from dyfn_worlds.render.renderer import Look, Renderer
+from dyfn_worlds.render.renderer import Renderer, Shading
 from dyfn_worlds.scene.actors import Moment
 
 VIEWS = 12
@@ -47,7 +47,7 @@ def main() -> None:
             moment = Moment(stand(space, rng, scene.actors, camera, 3))
             renderer.draw(camera)
             rows["plain"].append(cpu(lambda c=camera: renderer.draw(c)))  # type: ignore[misc]
-            rows["moving"].append(cpu(lambda c=camera, m=moment: renderer.draw(c, Look(), m)))  # type: ignore[misc]
+            rows["moving"].append(cpu(lambda c=camera, m=moment: renderer.draw(c, Shading(), m)))  # type: ignore[misc]
             picture = renderer.draw(camera)
             rows["corners"].append(
                 cpu(lambda p=picture: shade_corners(p.image, p.depth, 0.8, 1.0))  # type: ignore[misc]

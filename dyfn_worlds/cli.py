@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dyfn_worlds.generate import Job, MapWorlds, RoomWorlds, render
+from dyfn_worlds.generate import MapWorlds, RoomWorlds, ShardJob, render
 
 
 def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
@@ -29,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parse_arguments(argv)
     height, width = (int(x) for x in options.size.split("x"))
     size = (height, width)
-    job = Job(
+    job = ShardJob(
         options.worlds,
         options.shards,
         options.views,

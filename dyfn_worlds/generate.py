@@ -27,7 +27,7 @@ HELD_OUT_SEEDS = 10
 
 
 @dataclass(frozen=True)
-class Job:
+class ShardJob:
     """How much of one kind of world to render, and how.
 
     clip_frames: length of a clip; 0 renders independent views, `views` of them for each shard.
@@ -89,7 +89,7 @@ class RoomWorlds:
 
 
 def render(
-    job: Job, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable[[str], None]
+    job: ShardJob, worlds: MapWorlds | RoomWorlds, out: Path, report: Callable[[str], None]
 ) -> None:
     """Writes the job's shards that are not there yet; one in HELD_OUT_SEEDS is held out."""
     renderer = Renderer(job.size)

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.render.renderer import RenderCamera
 
 DEPTH_INVALID = 0
 DEPTH_INFINITE = 65535
@@ -18,7 +18,7 @@ MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """image H x W x 3 uint8 RGB; depth H x W float32 metres, +inf for the sky.
 
     moving: H x W bool, what moves on its own, or None. record: how the view was taken.
@@ -26,7 +26,7 @@ class View:
 
     image: np.ndarray
     depth: np.ndarray
-    camera: Camera
+    camera: RenderCamera
     moving: np.ndarray | None = None
     record: dict[str, object] = field(default_factory=dict)
 
@@ -40,7 +40,7 @@ def encode_depth(depth: np.ndarray) -> np.ndarray:
     return out
 
 
-def write_shard(folder: Path, views: list[View], meta: dict[str, object]) -> None:
+def write_shard(folder: Path, views: list[RenderedView], meta: dict[str, object]) -> None:
     """One folder of views, with a mask `%05d_moving.png` where something moves; meta.json is
     written last, so that a reader sees whole shards only."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ def existing_shards(root: Path) -> set[str]:
     return {p.parent.name for p in root.glob("*/*/meta.json")}
 
 
-def summarise(views: Iterable[View]) -> dict[str, float]:
+def summarise(views: Iterable[RenderedView]) -> dict[str, float]:
     """Depth quantiles in metres, for a progress line."""
     depth = np.concatenate([v.depth[::16, ::16].ravel() for v in views])
     solid = depth[np.isfinite(depth)]

@@ -25,7 +25,7 @@ from dyfn_core.experiments.scenes import Scene, predictions, scores_by_length
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.controls import ema_control, frozen_control
-from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.models.dyfn import DyFN
 from dyfn_core.training.loop.trainer import MODEL_FILE
 
 LENGTHS = (100, 200, 300, 400, 500)
@@ -109,7 +109,7 @@ def _lengths(experiment: Experiment, runner: Runner, lengths: Sequence[int]) -> 
         return [f"Not run: no sequence has {min(lengths)} frames, the longest has {longest}."]
     folders = [runner.train(experiment.arms[0], seed) for seed in range(runner.plan.seeds)]
     channels = runner.model.latent_channels
-    rows: dict[str, list[Stabilizer | None]] = {
+    rows: dict[str, list[DyFN | None]] = {
         "base": [None],
         "ema": [ema_control(channels)],
         "frozen": [frozen_control(channels)],
@@ -127,7 +127,7 @@ def _lengths(experiment: Experiment, runner: Runner, lengths: Sequence[int]) -> 
 def _curve(
     model: GeometryModel,
     scenes: Sequence[Scene],
-    stabilizer: Stabilizer | None,
+    stabilizer: DyFN | None,
     lengths: Sequence[int],
 ) -> dict[int, float]:
     """Number of frames -> mean over the scenes that have so many."""

@@ -12,7 +12,7 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """What happens to colours and sharpness. Everything is a value: applying it has no chance.
 
     colour: 3 x 3 on RGB in 0..1. gain, offset: per channel. gamma: exponent. blur: Gaussian sigma
@@ -41,16 +41,16 @@ class Look:
 
 
 @dataclass(frozen=True)
-class View:
+class Crop:
     """A crop window in normalised image coordinates (x0, y0, x1, y1) and a mirror flag."""
 
     window: tuple[float, float, float, float]
     flip: bool
 
 
-def draw_view(
+def draw_crop(
     rng: np.random.Generator, source_aspect: float, aspect: float, smallest: float = 0.5
-) -> View:
+) -> Crop:
     """A window of the given aspect (width / height) covering at least `smallest` of the fit.
 
     source_aspect: width / height of the frames. The window lies anywhere inside the frame.
@@ -59,14 +59,14 @@ def draw_view(
     zoom = rng.uniform(smallest, 1.0) if rng.random() < 0.8 else 1.0
     width, height = width * zoom, height * zoom
     x, y = rng.uniform(0, 1 - width), rng.uniform(0, 1 - height)
-    return View((x, y, x + width, y + height), bool(rng.random() < 0.5))
+    return Crop((x, y, x + width, y + height), bool(rng.random() < 0.5))
 
 
-def apply_view(
+def apply_crop(
     image: np.ndarray,
     depth: np.ndarray,
     intrinsics: np.ndarray,
-    view: View,
+    view: Crop,
     size: tuple[int, int],
     depth_size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,7 +101,7 @@ def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     return pose * signs[:, None] * signs
 
 
-def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
+def draw_appearance(rng: np.random.Generator, strength: float = 1.0) -> Appearance:
     """A random look; strength 0 changes nothing, 1 is the full range."""
 
     def spread(amount: float) -> float:
@@ -119,7 +119,7 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
     light = None
     if happens(0.4):
         light = np.exp(rng.normal(0, 0.35 * strength, (3, 4))).astype(np.float32)
-    look = Look(
+    look = Appearance(
         colour=_colour_matrix(spread(0.35), saturation),
         gain=gain,
         offset=offset,
@@ -142,7 +142,7 @@ def draw_look(rng: np.random.Generator, strength: float = 1.0) -> Look:
     )
 
 
-def apply_look(image: np.ndarray, look: Look, frame: int = 0) -> np.ndarray:
+def apply_appearance(image: np.ndarray, look: Appearance, frame: int = 0) -> np.ndarray:
     """image H x W x 3 uint8 -> the same, as that camera would have seen it.
 
     frame: index in the clip; only the noise differs from frame to frame.

@@ -14,7 +14,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from dyfn_core.data.augment import apply_look, apply_view, draw_look, draw_view, mirrored_pose
+from dyfn_core.data.augment import (
+    apply_appearance,
+    apply_crop,
+    draw_appearance,
+    draw_crop,
+    mirrored_pose,
+)
 from dyfn_core.data.frames import DataError, FrameError, FrameSequence
 from dyfn_core.data.pool import DataPool, DataSpec, open_pool
 
@@ -231,17 +237,17 @@ def draw_clip(
     if source.length > 1 and rng.random() < 0.5:
         indices = indices[::-1]
     depth_size = (size[0] // source.depth_divisor, size[1] // source.depth_divisor)
-    view, look = None, draw_look(rng, source.augment_strength)
+    view, look = None, draw_appearance(rng, source.augment_strength)
     frames, poses = [], []
     for number, index in enumerate(indices):
         frame = sequence.read(int(index))
         if view is None:
             aspect = frame.image.shape[1] / frame.image.shape[0]
-            view = draw_view(rng, aspect, size[1] / size[0], source.smallest_view)
-        image, depth, intrinsics = apply_view(
+            view = draw_crop(rng, aspect, size[1] / size[0], source.smallest_view)
+        image, depth, intrinsics = apply_crop(
             frame.image, frame.depth, frame.intrinsics, view, size, depth_size
         )
-        frames.append((apply_look(image, look, number), depth, intrinsics))
+        frames.append((apply_appearance(image, look, number), depth, intrinsics))
         if frame.pose is not None:
             poses.append(mirrored_pose(frame.pose) if view.flip else frame.pose)
     images, depths, cameras = (np.stack(parts) for parts in zip(*frames, strict=True))

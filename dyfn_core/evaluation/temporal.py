@@ -21,7 +21,7 @@ TRUTH = "truth"
 
 
 @dataclass(frozen=True)
-class View:
+class PosedCamera:
     """A camera at one time: matrix 3 x 3 in pixels of the depth it goes with, camera to world."""
 
     matrix: np.ndarray
@@ -29,7 +29,7 @@ class View:
 
 
 def reprojection_error(
-    depth: np.ndarray, other: np.ndarray, view: View, other_view: View
+    depth: np.ndarray, other: np.ndarray, view: PosedCamera, other_view: PosedCamera
 ) -> tuple[float, int] | None:
     """AbsRel of `depth`, moved into the other view, against `other`; and over how many pixels.
 
@@ -55,7 +55,7 @@ def _valid(depth: np.ndarray) -> np.ndarray:
 
 
 def _moved(
-    depth: np.ndarray, view: View, other_view: View
+    depth: np.ndarray, view: PosedCamera, other_view: PosedCamera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Depth in the other view and the row and column there, of every valid pixel in front of it."""
     v, u = np.nonzero(_valid(depth))
@@ -67,7 +67,7 @@ def _moved(
 
 
 def _project(
-    u: np.ndarray, v: np.ndarray, z: np.ndarray, view: View, other_view: View
+    u: np.ndarray, v: np.ndarray, z: np.ndarray, view: PosedCamera, other_view: PosedCamera
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pixels with depth -> points 3 x N and pixels 2 x N (float) of the other view."""
     rays = np.linalg.inv(view.matrix) @ np.stack([u, v, np.ones(len(z))])
@@ -79,7 +79,7 @@ def _project(
 
 
 def temporal_alignment_error(
-    first: np.ndarray, second: np.ndarray, first_view: View, second_view: View
+    first: np.ndarray, second: np.ndarray, first_view: PosedCamera, second_view: PosedCamera
 ) -> float | None:
     """Mean of both directions' reprojection_error between two frames (Video Depth Anything's TAE).
 
@@ -101,7 +101,7 @@ def flicker(first: np.ndarray, second: np.ndarray, static: np.ndarray) -> float 
 def static_pixels(
     first: np.ndarray,
     second: np.ndarray,
-    views: tuple[View, View] | None = None,
+    views: tuple[PosedCamera, PosedCamera] | None = None,
     greys: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """H x W bool: where two neighbouring frames show one point of the scene at one place.
@@ -134,7 +134,7 @@ class TemporalScorer:
     def __init__(self, samples: int = 20_000) -> None:
         self.samples = samples
         self._file: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - lives until close()
-        self._views: list[View | None] = []
+        self._views: list[PosedCamera | None] = []
         self._shapes: list[tuple[int, int]] = []
         self._names: tuple[str, ...] = ()
 
@@ -160,7 +160,7 @@ class TemporalScorer:
         known = camera_matrix is not None and pose is not None
         view = None
         if known and camera_matrix is not None and pose is not None:
-            view = View(_on_grid(camera_matrix, image.shape, truth.shape, grid), pose)
+            view = PosedCamera(_on_grid(camera_matrix, image.shape, truth.shape, grid), pose)
         self._views.append(view)
 
     def results(

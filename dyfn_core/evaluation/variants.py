@@ -14,7 +14,7 @@ import torch
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.controls import latent_controls, stabilized_by
-from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import StreamState
 from dyfn_core.scoring.protocols import CONTROLS, SequenceScorer, to_shape
 
@@ -58,7 +58,7 @@ def score_variants(
 def _score_sequence(
     model: GeometryModel, sequence: FrameSource, num_tokens: int | None
 ) -> dict[str, VariantScore]:
-    stabilizers: dict[str, Stabilizer | None] = {
+    stabilizers: dict[str, DyFN | None] = {
         "base": None,
         **latent_controls(model),
     }

@@ -17,7 +17,7 @@ from dyfn_core.experiments.declared import Arm
 from dyfn_core.experiments.scenes import Scene, encode_scene, score_controls, score_stabilizer
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.dyfn import StabilizerConfig
+from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.training.config import StabilizerRunConfig, read_config
 from dyfn_core.training.loop.checkpoint import has_state
 from dyfn_core.training.loop.processes import Processes
@@ -185,7 +185,7 @@ def _frames(sequence: FrameSequence, stride: int) -> Any:
 def _digest(config: StabilizerRunConfig) -> str:
     """Short name of an arm's settings; arms of different experiments that agree share runs."""
     plain: dict[str, Any] = config.model_dump(mode="json", exclude=BOOKKEEPING)
-    plain["stabilizer"] = StabilizerConfig(**config.stabilizer).to_dict()
+    plain["stabilizer"] = DyFNConfig(**config.stabilizer).to_dict()
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 

@@ -11,7 +11,7 @@ import torch
 from dyfn_core.evaluation.variants import VariantScore
 from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.controls import ema_control, frozen_control, stabilized_by
-from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DEPTH, StreamState
 from dyfn_core.scoring.protocols import CONTROLS, SequenceScorer, to_shape
 
@@ -43,7 +43,7 @@ def encode_scene(
 
 @torch.inference_mode()
 def predictions(
-    model: GeometryModel, scene: Scene, stabilizer: Stabilizer | None
+    model: GeometryModel, scene: Scene, stabilizer: DyFN | None
 ) -> Iterator[np.ndarray]:
     """Affine depth (or disparity) of each frame, at the size of its truth, so stabilized."""
     state: StreamState | None = None
@@ -55,7 +55,7 @@ def predictions(
 
 
 def score_stabilizer(
-    model: GeometryModel, scenes: Sequence[Scene], stabilizer: Stabilizer | None
+    model: GeometryModel, scenes: Sequence[Scene], stabilizer: DyFN | None
 ) -> VariantScore:
     """Mean over the scenes of AbsRel and delta1 under the image and video protocols."""
     return _mean([_score(s, predictions(model, s, stabilizer), model.quantity) for s in scenes])

@@ -54,7 +54,7 @@ class CalibrationOptions:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class ScaleCalibration:
     """All that a calibrator remembers; a value.
 
     map: in force; None before there is one. spread, points: of the last fit that agreed with
@@ -77,7 +77,7 @@ class Calibration:
     problem: str = ""
 
 
-class Calibrator:
+class ScaleCalibrator:
     """Evidence in, a metric map out; deterministic in the evidence since the last reset.
 
     dropped: points that could not be used, by reason, over its whole life.
@@ -85,12 +85,12 @@ class Calibrator:
 
     def __init__(self, options: CalibrationOptions | None = None) -> None:
         self.options = options or CalibrationOptions()
-        self.state = Calibration()
+        self.state = ScaleCalibration()
         self.dropped: Counter[str] = Counter()
 
     def reset(self) -> None:
         """Forget the calibration: the stream's unit may be another one now."""
-        self.state = Calibration()
+        self.state = ScaleCalibration()
 
     def push(self, evidence: Evidence) -> None:
         """One measurement, in the order of the stamps. One without pairs moves nothing."""
@@ -141,7 +141,7 @@ class Calibrator:
             max_spread=self.options.max_spread,
         )
 
-    def _calibrated(self, fit: Fit, now: float) -> Calibration:
+    def _calibrated(self, fit: Fit, now: float) -> ScaleCalibration:
         return replace(
             self.state,
             map=fit.map,
@@ -154,7 +154,7 @@ class Calibrator:
             problem="",
         )
 
-    def _compared(self, old: MetricMap, fit: Fit, now: float) -> Calibration:
+    def _compared(self, old: MetricMap, fit: Fit, now: float) -> ScaleCalibration:
         state, options = self.state, self.options
         apart = _log_difference(old, fit)
         limit = options.disagreement * (0.5 if state.disagrees else 1.0)

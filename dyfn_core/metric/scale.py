@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyfn_core.metric.calibration import CalibrationOptions, Calibrator
+from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibrator
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.ground import ground_evidence, up_from_pitch
 from dyfn_core.metric.references import DepthView, Reference
@@ -82,7 +82,7 @@ class MetricScale:
 
     def __init__(self, options: ScaleOptions | None = None) -> None:
         self.options = options or ScaleOptions()
-        self.calibrator = Calibrator(self.options.calibration)
+        self.calibrator = ScaleCalibrator(self.options.calibration)
 
     def reset(self) -> None:
         """The stream started anew."""

@@ -16,7 +16,7 @@ from dyfn_core.geometry.camera import (
     intrinsics_from_focal,
     recover_focal_shift,
 )
-from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DEPTH, DISPARITY, Prediction, StreamState
 
 NOMINAL_FOV = 60.0  # degrees, of an unknown camera whose model gives no point map
@@ -93,7 +93,7 @@ class GeometryModel(nn.Module, ABC):
     stabilizer_pool: int = 1
     token_cell: int = 14
     # No class-level None here: it would hide the registered submodule.
-    stabilizer: Stabilizer | None
+    stabilizer: DyFN | None
 
     def __init__(self) -> None:
         super().__init__()

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.depth_anything import DepthAnythingModel, official_encoder
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
 
@@ -112,8 +112,8 @@ def empty_model(config: Mapping[str, Any], source: str = "config") -> GeometryMo
     try:
         model = MODEL_TYPES[kind].from_config(dict(config))
         if config.get("stabilizer") is not None:
-            described = StabilizerConfig(**config["stabilizer"])
-            model.stabilizer = build_stabilizer(model.latent_channels, described)
+            described = DyFNConfig(**config["stabilizer"])
+            model.stabilizer = build_dyfn(model.latent_channels, described)
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{source}: bad model config: {error}") from error
     return model
@@ -274,7 +274,7 @@ def _from_official_config(config: dict[str, Any], path: Path) -> dict[str, Any]:
     if kind is not None:
         if not isinstance(kind, str) or kind.lower() not in ("convgru", "gru"):
             raise CheckpointError(f"{path}: stabilizer_type {kind!r} is unknown")
-        ours["stabilizer"] = StabilizerConfig(kind=kind.lower()).to_dict()
+        ours["stabilizer"] = DyFNConfig(kind=kind.lower()).to_dict()
     known = {field.name for field in fields(MoGeConfig)} | {"type", "stabilizer"}
     for key in sorted(set(ours) - known):
         logger.warning("%s: ignoring model_config entry %s = %r", path, key, ours.pop(key))

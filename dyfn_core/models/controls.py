@@ -9,20 +9,20 @@ import torch
 from torch import Tensor
 
 from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.dyfn import EPSILON, Stabilizer, StabilizerConfig
+from dyfn_core.models.dyfn import EPSILON, DyFN, DyFNConfig
 from dyfn_core.prediction import StreamState
 
 EMA_ALPHA = 0.1
 
 
-class StatisticsControl(Stabilizer):
+class StatisticsControl(DyFN):
     """Replaces the latent's statistics by a moving average of themselves; nothing is learned.
 
     alpha: weight of the present frame; 0 keeps the first frame's statistics, 1 changes nothing.
     """
 
     def __init__(self, channels: int, alpha: float) -> None:
-        super().__init__(channels, StabilizerConfig())
+        super().__init__(channels, DyFNConfig())
         if not 0 <= alpha <= 1:
             raise ValueError(f"alpha must be in 0..1, got {alpha}")
         self.alpha = alpha
@@ -49,7 +49,7 @@ def frozen_control(channels: int) -> StatisticsControl:
     return StatisticsControl(channels, 0.0)
 
 
-def latent_controls(model: GeometryModel) -> dict[str, Stabilizer]:
+def latent_controls(model: GeometryModel) -> dict[str, DyFN]:
     """What the model's own stabilizer is compared with, by name, on the model's device."""
     channels = model.latent_channels
     return {
@@ -59,7 +59,7 @@ def latent_controls(model: GeometryModel) -> dict[str, Stabilizer]:
 
 
 @contextlib.contextmanager
-def stabilized_by(model: GeometryModel, stabilizer: Stabilizer | None) -> Iterator[GeometryModel]:
+def stabilized_by(model: GeometryModel, stabilizer: DyFN | None) -> Iterator[GeometryModel]:
     """Inside, the model has this stabilizer (or none); afterwards its own again."""
     own = model.stabilizer
     model.stabilizer = stabilizer

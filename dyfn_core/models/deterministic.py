@@ -16,7 +16,7 @@ from torch import Tensor, nn
 FEW_CHANNELS = 4  # below, torch's resize adds up in another order on another number of threads
 
 
-class Conv2d(nn.Conv2d):
+class DeterministicConv2d(nn.Conv2d):
     """nn.Conv2d without dilation and with padding in numbers; the same parameters."""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ class Conv2d(nn.Conv2d):
         return convolve(x, self.weight, self.bias, self.stride[0], padding, self.groups)
 
 
-class GroupNorm(nn.GroupNorm):
+class DeterministicGroupNorm(nn.GroupNorm):
     """nn.GroupNorm on planes: on channels_last torch sums per thread."""
 
     def forward(self, x: Tensor) -> Tensor:
@@ -38,7 +38,7 @@ class GroupNorm(nn.GroupNorm):
         return super().forward(x.contiguous())
 
 
-class Linear(nn.Linear):
+class DeterministicLinear(nn.Linear):
     """nn.Linear on tokens or rows; the same parameters."""
 
     def forward(self, x: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.deterministic import Conv2d, Linear
+from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear
 
 PATCH = 14
 TRAINED_GRID = 37
@@ -28,7 +28,7 @@ class PatchEmbedding(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.proj = Conv2d(3, channels, PATCH, stride=PATCH)
+        self.proj = DeterministicConv2d(3, channels, PATCH, stride=PATCH)
 
     def forward(self, image: Tensor) -> Tensor:
         """image: H and W multiples of 14."""
@@ -41,8 +41,8 @@ class Attention(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.qkv = Linear(channels, 3 * channels)
-        self.proj = Linear(channels, channels)
+        self.qkv = DeterministicLinear(channels, 3 * channels)
+        self.proj = DeterministicLinear(channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""
@@ -57,8 +57,8 @@ class FeedForward(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.fc1 = Linear(channels, 4 * channels)
-        self.fc2 = Linear(4 * channels, channels)
+        self.fc1 = DeterministicLinear(channels, 4 * channels)
+        self.fc2 = DeterministicLinear(4 * channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.deterministic import Conv2d, resize
+from dyfn_core.models.deterministic import DeterministicConv2d, resize
 
 OUTPUT_CHANNELS = 32
 
@@ -18,8 +18,8 @@ class ResidualConvUnit(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.conv1 = Conv2d(channels, channels, 3, padding=1)
-        self.conv2 = Conv2d(channels, channels, 3, padding=1)
+        self.conv1 = DeterministicConv2d(channels, channels, 3, padding=1)
+        self.conv2 = DeterministicConv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x C x h x w."""
@@ -33,7 +33,7 @@ class FusionBlock(nn.Module):
         super().__init__()
         self.resConfUnit1 = ResidualConvUnit(channels)
         self.resConfUnit2 = ResidualConvUnit(channels)
-        self.out_conv = Conv2d(channels, channels, 1)
+        self.out_conv = DeterministicConv2d(channels, channels, 1)
 
     def forward(self, path: Tensor, layer: Tensor | None) -> Tensor:
         """path, layer: B x C x h x w; the coarsest block has no layer beside it."""
@@ -49,18 +49,18 @@ class Scratch(nn.Module):
     def __init__(self, widths: tuple[int, ...], channels: int) -> None:
         super().__init__()
         self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = (
-            Conv2d(width, channels, 3, padding=1, bias=False) for width in widths
+            DeterministicConv2d(width, channels, 3, padding=1, bias=False) for width in widths
         )
         self.refinenet1 = FusionBlock(channels)
         self.refinenet2 = FusionBlock(channels)
         self.refinenet3 = FusionBlock(channels)
         # The coarsest block's first unit is in every official file and has no input.
         self.refinenet4 = FusionBlock(channels)
-        self.output_conv1 = Conv2d(channels, channels // 2, 3, padding=1)
+        self.output_conv1 = DeterministicConv2d(channels, channels // 2, 3, padding=1)
         self.output_conv2 = nn.Sequential(
-            Conv2d(channels // 2, OUTPUT_CHANNELS, 3, padding=1),
+            DeterministicConv2d(channels // 2, OUTPUT_CHANNELS, 3, padding=1),
             nn.ReLU(),
-            Conv2d(OUTPUT_CHANNELS, 1, 1),
+            DeterministicConv2d(OUTPUT_CHANNELS, 1, 1),
         )
 
 
@@ -73,13 +73,15 @@ class DPTHead(nn.Module):
 
     def __init__(self, encoder_channels: int, widths: tuple[int, ...], channels: int) -> None:
         super().__init__()
-        self.projects = nn.ModuleList(Conv2d(encoder_channels, width, 1) for width in widths)
+        self.projects = nn.ModuleList(
+            DeterministicConv2d(encoder_channels, width, 1) for width in widths
+        )
         self.resize_layers = nn.ModuleList(
             [
                 nn.ConvTranspose2d(widths[0], widths[0], 4, stride=4),
                 nn.ConvTranspose2d(widths[1], widths[1], 2, stride=2),
                 nn.Identity(),
-                Conv2d(widths[3], widths[3], 3, stride=2, padding=1),
+                DeterministicConv2d(widths[3], widths[3], 3, stride=2, padding=1),
             ]
         )
         self.scratch = Scratch(widths, channels)

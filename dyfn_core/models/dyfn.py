@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.deterministic import Conv2d, Linear
+from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear
 from dyfn_core.prediction import StreamState
 
 EPSILON = 1e-5
@@ -21,7 +21,7 @@ FORMS = ("paper", "residual")
 
 
 @dataclass(frozen=True)
-class StabilizerConfig:
+class DyFNConfig:
     """Which DyFN.
 
     kind: "convgru" (the paper's) or "gru" (its ablation, on the pooled latent).
@@ -64,17 +64,17 @@ class StabilizerConfig:
         return asdict(self)
 
 
-def build_stabilizer(channels: int, config: StabilizerConfig) -> Stabilizer:
+def build_dyfn(channels: int, config: DyFNConfig) -> DyFN:
     """A fresh, untrained DyFN for a latent of so many channels."""
     if config.kind == "gru":
-        return GRUStabilizer(channels, config)
-    return ConvGRUStabilizer(channels, config)
+        return GRUDyFN(channels, config)
+    return ConvGRUDyFN(channels, config)
 
 
-class Stabilizer(nn.Module, ABC):
+class DyFN(nn.Module, ABC):
     """What both variants share: statistics out, statistics in, both per channel."""
 
-    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+    def __init__(self, channels: int, config: DyFNConfig) -> None:
         super().__init__()
         self.channels = channels
         self.config = config
@@ -166,8 +166,8 @@ class ConvGRUCell(nn.Module):
 
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
-        self.conv_gates = Conv2d(channels + hidden, 2 * hidden, 3, padding=1)
-        self.conv_candidate = Conv2d(channels + hidden, hidden, 3, padding=1)
+        self.conv_gates = DeterministicConv2d(channels + hidden, 2 * hidden, 3, padding=1)
+        self.conv_candidate = DeterministicConv2d(channels + hidden, hidden, 3, padding=1)
 
     def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
         """x B x C x h x w, hidden B x D x h x w -> next hidden, same shape."""
@@ -177,14 +177,14 @@ class ConvGRUCell(nn.Module):
         return torch.lerp(hidden, candidate, update)
 
 
-class ConvGRUStabilizer(Stabilizer):
+class ConvGRUDyFN(DyFN):
     """The paper's DyFN: h_t = ConvGRU(F_t, h_{t-1}), statistics from 1 x 1 heads, pooled."""
 
-    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+    def __init__(self, channels: int, config: DyFNConfig) -> None:
         super().__init__(channels, config)
         self.conv_gru_cell = ConvGRUCell(channels, config.hidden)
-        self.gamma_head = Conv2d(config.hidden, channels, 1)
-        self.beta_head = Conv2d(config.hidden, channels, 1)
+        self.gamma_head = DeterministicConv2d(config.hidden, channels, 1)
+        self.beta_head = DeterministicConv2d(config.hidden, channels, 1)
         nn.init.zeros_(self.gamma_head.weight)
         nn.init.zeros_(self.beta_head.weight)
         nn.init.constant_(self.gamma_head.bias, 1.0 if config.form == "paper" else 0.0)  # type: ignore[arg-type]
@@ -215,17 +215,17 @@ class ConvGRUStabilizer(Stabilizer):
         return F.adaptive_avg_pool2d(features, size)
 
 
-class GRUStabilizer(Stabilizer):
+class GRUDyFN(DyFN):
     """The paper's ablation: a GRU on the pooled latent corrects a moving average (alpha 0.1).
 
     The moving average lives in the stream's state, not in the module.
     """
 
-    def __init__(self, channels: int, config: StabilizerConfig) -> None:
+    def __init__(self, channels: int, config: DyFNConfig) -> None:
         super().__init__(channels, config)
         self.gru_cell = nn.GRUCell(channels, config.hidden)
-        self.gamma_delta_head = Linear(config.hidden, channels)
-        self.beta_delta_head = Linear(config.hidden, channels)
+        self.gamma_delta_head = DeterministicLinear(config.hidden, channels)
+        self.beta_delta_head = DeterministicLinear(config.hidden, channels)
         for head in (self.gamma_delta_head, self.beta_delta_head):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)

@@ -16,7 +16,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.deterministic import Conv2d, GroupNorm, Linear, resize
+from dyfn_core.models.deterministic import (
+    DeterministicConv2d,
+    DeterministicGroupNorm,
+    DeterministicLinear,
+    resize,
+)
 from dyfn_core.models.efficientnet import (
     FEATURE_CHANNELS,
     IMAGE_MEAN,
@@ -56,7 +61,7 @@ class MiniConfig:
     folded: bool = True
 
 
-class ResidualBlock(nn.Module):
+class MiniResidualBlock(nn.Module):
     """x + conv(act(norm(conv(act(norm(x)))))), every channel normalised by itself.
 
     The latent's channels sit at very different levels, and that is where it keeps the scale. Norms
@@ -66,10 +71,10 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = GroupNorm(channels, channels)
-        self.first = Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm_second = GroupNorm(channels, channels)
-        self.second = Conv2d(channels, channels, 3, padding=1)
+        self.norm = DeterministicGroupNorm(channels, channels)
+        self.first = DeterministicConv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm_second = DeterministicGroupNorm(channels, channels)
+        self.second = DeterministicConv2d(channels, channels, 3, padding=1)
         nn.init.normal_(self.second.weight, std=1e-2)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 
@@ -84,13 +89,15 @@ class ContextLayer(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         self.heads = heads
-        self.position = Conv2d(channels, channels, 3, padding=1, groups=channels)
+        self.position = DeterministicConv2d(channels, channels, 3, padding=1, groups=channels)
         self.norm_attention = nn.LayerNorm(channels)
-        self.qkv = Linear(channels, 3 * channels)
-        self.out = Linear(channels, channels)
+        self.qkv = DeterministicLinear(channels, 3 * channels)
+        self.out = DeterministicLinear(channels, channels)
         self.norm_mlp = nn.LayerNorm(channels)
         self.mlp = nn.Sequential(
-            Linear(channels, 2 * channels), nn.GELU(), Linear(2 * channels, channels)
+            DeterministicLinear(channels, 2 * channels),
+            nn.GELU(),
+            DeterministicLinear(2 * channels, channels),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -111,7 +118,7 @@ class Neck(nn.Module):
     def __init__(self, config: MiniConfig) -> None:
         super().__init__()
         fine, middle, deep = FEATURE_CHANNELS
-        self.context_in = Conv2d(deep, config.context_channels, 1)
+        self.context_in = DeterministicConv2d(deep, config.context_channels, 1)
         self.context = nn.Sequential(
             *(
                 ContextLayer(config.context_channels, config.context_heads)
@@ -119,11 +126,11 @@ class Neck(nn.Module):
             )
         )
         channels = config.latent_channels
-        self.project_fine = Conv2d(fine, channels, 1)
-        self.project_middle = Conv2d(middle, channels, 1)
-        self.project_deep = Conv2d(config.context_channels, channels, 1)
-        self.refine_middle = ResidualBlock(channels) if config.refine else nn.Identity()
-        self.refine_fine = ResidualBlock(channels) if config.refine else nn.Identity()
+        self.project_fine = DeterministicConv2d(fine, channels, 1)
+        self.project_middle = DeterministicConv2d(middle, channels, 1)
+        self.project_deep = DeterministicConv2d(config.context_channels, channels, 1)
+        self.refine_middle = MiniResidualBlock(channels) if config.refine else nn.Identity()
+        self.refine_fine = MiniResidualBlock(channels) if config.refine else nn.Identity()
 
     def forward(self, features: list[Tensor]) -> Tensor:
         fine, middle, deep = (
@@ -145,20 +152,23 @@ class Decoder(nn.Module):
         joins, stages = [], []
         channels = config.latent_channels
         for width in config.stage_channels:
-            joins.append(Conv2d(channels + 2, width, 1))
-            stages.append(ResidualBlock(width))
+            joins.append(DeterministicConv2d(channels + 2, width, 1))
+            stages.append(MiniResidualBlock(width))
             channels = width
         self.joins, self.stages = nn.ModuleList(joins), nn.ModuleList(stages)
-        out = Conv2d(32, 3 * 4, 1)
+        out = DeterministicConv2d(32, 3 * 4, 1)
         nn.init.normal_(out.weight, std=1e-2)
         nn.init.zeros_(out.bias)  # type: ignore[arg-type]
         self.points = nn.Sequential(
-            Conv2d(channels + 2, 32, 3, padding=1), nn.LeakyReLU(SLOPE), out, nn.PixelShuffle(2)
+            DeterministicConv2d(channels + 2, 32, 3, padding=1),
+            nn.LeakyReLU(SLOPE),
+            out,
+            nn.PixelShuffle(2),
         )
         self.mask = nn.Sequential(
-            Conv2d(channels + 2, 16, 3, padding=1),
+            DeterministicConv2d(channels + 2, 16, 3, padding=1),
             nn.LeakyReLU(SLOPE),
-            Conv2d(16, 4, 1),
+            DeterministicConv2d(16, 4, 1),
             nn.PixelShuffle(2),
         )
 

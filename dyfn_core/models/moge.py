@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.deterministic import Conv2d, GroupNorm, resize
+from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicGroupNorm, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.prediction import StreamState
 
@@ -73,12 +73,12 @@ class ResidualBlock(nn.Module):
         super().__init__()
         groups = hidden // 32 if norm == "group_norm" else 1
         self.layers = nn.Sequential(
-            GroupNorm(1, channels),
+            DeterministicGroupNorm(1, channels),
             nn.ReLU(),
-            Conv2d(channels, hidden, 3, padding=1, padding_mode="replicate"),
-            GroupNorm(groups, hidden),
+            DeterministicConv2d(channels, hidden, 3, padding=1, padding_mode="replicate"),
+            DeterministicGroupNorm(groups, hidden),
             nn.ReLU(),
-            Conv2d(hidden, channels, 3, padding=1, padding_mode="replicate"),
+            DeterministicConv2d(hidden, channels, 3, padding=1, padding_mode="replicate"),
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -92,7 +92,7 @@ class Head(nn.Module):
     def __init__(self, config: MoGeConfig, num_features: int, encoder_channels: int) -> None:
         super().__init__()
         self.projects = nn.ModuleList(
-            Conv2d(encoder_channels, config.dim_proj, 1) for _ in range(num_features)
+            DeterministicConv2d(encoder_channels, config.dim_proj, 1) for _ in range(num_features)
         )
         widths = [config.dim_proj, *config.dim_upsample]
         self.upsample_blocks = nn.ModuleList(
@@ -129,7 +129,7 @@ def _upsample_block(before: int, after: int, config: MoGeConfig) -> nn.Sequentia
     enlarge = nn.ConvTranspose2d(before + 2, after, 2, stride=2)
     with torch.no_grad():
         enlarge.weight.copy_(enlarge.weight[:, :, :1, :1].expand_as(enlarge.weight).clone())
-    smooth = Conv2d(after, after, 3, padding=1, padding_mode="replicate")
+    smooth = DeterministicConv2d(after, after, 3, padding=1, padding_mode="replicate")
     hidden = config.dim_times_res_block_hidden * after
     return nn.Sequential(
         nn.Sequential(enlarge, smooth),
@@ -144,13 +144,15 @@ def _output_block(count: int, config: MoGeConfig) -> nn.Sequential:
     width, size = config.last_conv_channels, config.last_conv_size
     hidden = config.dim_times_res_block_hidden * width
     return nn.Sequential(
-        Conv2d(config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"),
+        DeterministicConv2d(
+            config.dim_upsample[-1] + 2, width, 3, padding=1, padding_mode="replicate"
+        ),
         *(
             ResidualBlock(width, hidden, config.res_block_norm)
             for _ in range(config.last_res_blocks)
         ),
         nn.ReLU(),
-        Conv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
+        DeterministicConv2d(width, count, size, padding=size // 2, padding_mode="replicate"),
     )
 
 

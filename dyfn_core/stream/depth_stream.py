@@ -43,7 +43,7 @@ NEW_CAMERA = "camera matrix changed"
 
 
 @dataclass(frozen=True)
-class Track:
+class MeanState:
     """What a RobustMean remembers. spread: mean absolute innovation. count: measurements seen."""
 
     value: float
@@ -63,10 +63,10 @@ class RobustMean:
     gain: float = 0.02
     clip: float = 3.0
 
-    def update(self, track: Track | None, measured: float) -> Track:
+    def update(self, track: MeanState | None, measured: float) -> MeanState:
         """The track after one more measurement; None starts one."""
         if track is None:
-            return Track(measured)
+            return MeanState(measured)
         count = track.count + 1
         weight = max(1 / count, self.gain)
         innovation = measured - track.value
@@ -74,7 +74,7 @@ class RobustMean:
         step = min(max(innovation, -limit), limit)
         # The spread may grow faster than the value moves, so that a real change gets through.
         spread = track.spread + weight * (min(abs(innovation), 2 * limit) - track.spread)
-        return Track(track.value + weight * step, spread, count)
+        return MeanState(track.value + weight * step, spread, count)
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class StreamMemory:
     image_size: tuple[int, int] | None = None
     stamp: float | None = None
     state: StreamState | None = None
-    focal: Track | None = None
-    shift: Track | None = None
+    focal: MeanState | None = None
+    shift: MeanState | None = None
     unit: float | None = None
 
 

@@ -21,7 +21,7 @@ _BLANK_PATIENCE = 10  # blank pictures before the last scene is forgotten
 
 
 @dataclass(frozen=True)
-class Look:
+class PictureFeatures:
     """A picture as the detector remembers it.
 
     opponent: 24 x 32 x 3 float32, grey, red - green, blue - yellow. texture: 16 float32,
@@ -39,7 +39,7 @@ class Look:
         return bool((self.texture > _TEXTURE).sum() < _FEWEST)
 
 
-def look_at(image: np.ndarray) -> Look:
+def picture_features(image: np.ndarray) -> PictureFeatures:
     """image: H x W x 3 uint8 RGB, any size."""
     step = max(1, min(image.shape[0] // (4 * SIZE[1]), image.shape[1] // (4 * SIZE[0])))
     small = cv2.resize(image[::step, ::step], SIZE, interpolation=cv2.INTER_AREA)
@@ -47,7 +47,7 @@ def look_at(image: np.ndarray) -> Look:
     grey, yellow = (red + green + blue) / 3, (red + green) / 2
     blocks = grey.reshape(GRID[1], BLOCK[1], GRID[0], BLOCK[0]).transpose(0, 2, 1, 3)
     texture = blocks.reshape(GRID[0] * GRID[1], -1).std(axis=1)
-    return Look(np.dstack([grey, red - green, blue - yellow]), texture, _colours(small))
+    return PictureFeatures(np.dstack([grey, red - green, blue - yellow]), texture, _colours(small))
 
 
 def _colours(small: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def _colours(small: np.ndarray) -> np.ndarray:
     return counts / counts.sum()
 
 
-def structure_difference(before: Look, now: Look) -> float:
+def structure_difference(before: PictureFeatures, now: PictureFeatures) -> float:
     """0 when the blocks of the earlier picture are all found in the later one, moved together;
     about 0.6 and more when they are not.
 
@@ -113,7 +113,7 @@ def _displaced() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 _DISPLACED = _displaced()
 
 
-def colour_difference(before: Look, now: Look) -> float:
+def colour_difference(before: PictureFeatures, now: PictureFeatures) -> float:
     """0 for the same chromaticities, 1 for none in common."""
     return float(1 - np.minimum(before.colours, now.colours).sum())
 
@@ -123,7 +123,7 @@ class CutState:
     """What the detector remembers: the last picture that showed something, whether the pictures
     have been alike again since the last cut, and how many blank ones came in a row."""
 
-    look: Look | None = None
+    look: PictureFeatures | None = None
     armed: bool = True
     blank: int = 0
 
@@ -145,7 +145,7 @@ class SceneCutDetector:
 
     def push(self, image: np.ndarray) -> bool:
         """image: H x W x 3 uint8 RGB. -> whether it begins a new scene."""
-        look, state = look_at(image), self.state
+        look, state = picture_features(image), self.state
         self.difference = math.nan
         if look.blank:
             forget = state.blank + 1 >= _BLANK_PATIENCE
@@ -167,6 +167,6 @@ class SceneCutDetector:
         self.difference = math.nan
 
 
-def scene_difference(before: Look, now: Look) -> float:
+def scene_difference(before: PictureFeatures, now: PictureFeatures) -> float:
     """Structure and colour together: 0 the same, about 1 when nothing is left. NaN: blank."""
     return structure_difference(before, now) + 0.5 * colour_difference(before, now)

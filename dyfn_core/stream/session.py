@@ -183,7 +183,7 @@ def stream_maker(model: GeometryModel) -> StreamMaker:
 
 
 @dataclass
-class CameraStream:
+class StreamSession:
     """Not for several threads at once: the inference thread owns it.
 
     resets: how often the stream started anew, by reason.

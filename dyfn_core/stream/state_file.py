@@ -17,15 +17,15 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
-from dyfn_core.metric.calibration import Calibration
+from dyfn_core.metric.calibration import ScaleCalibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import full_config
 from dyfn_core.prediction import StreamState
-from dyfn_core.stream.depth_stream import DepthStream, StreamMemory, Track
+from dyfn_core.stream.depth_stream import DepthStream, MeanState, StreamMemory
 from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
-from dyfn_core.stream.scene_cut import CutState, Look
+from dyfn_core.stream.scene_cut import CutState, PictureFeatures
 
 FORMAT = "dyfn-stream 1"
 
@@ -45,7 +45,7 @@ class SavedStream:
 
     memory: StreamMemory
     camera_matrix: np.ndarray | None
-    calibration: Calibration | None = None
+    calibration: ScaleCalibration | None = None
     cut: CutState | None = None
     options: dict[str, Any] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
@@ -57,12 +57,12 @@ _KINDS: dict[str, type] = {
         SavedStream,
         StreamMemory,
         StreamState,
-        Track,
-        Calibration,
+        MeanState,
+        ScaleCalibration,
         MetricMap,
         Evidence,
         CutState,
-        Look,
+        PictureFeatures,
     )
 }
 
@@ -93,7 +93,7 @@ def save_stream(
     stream: DepthStream,
     fingerprint: str,
     *,
-    calibration: Calibration | None = None,
+    calibration: ScaleCalibration | None = None,
     cut: CutState | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:

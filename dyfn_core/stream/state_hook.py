@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dyfn_core.stream.session import (
-    CameraStream,
     Geometry,
     StreamFrame,
     StreamHook,
     StreamKey,
+    StreamSession,
 )
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class StateHook(StreamHook):
     """
 
     def __init__(
-        self, stream: CameraStream, metric: MetricHook, cut: SceneCutHook, model: GeometryModel
+        self, stream: StreamSession, metric: MetricHook, cut: SceneCutHook, model: GeometryModel
     ) -> None:
         from dyfn_core.stream.state_file import model_fingerprint
 

@@ -22,7 +22,7 @@ from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
 from dyfn_core.losses.objective import Objective
-from dyfn_core.models.dyfn import StabilizerConfig
+from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.models.mini import MiniConfig
 from dyfn_core.training.config_errors import check_fields, describe
 
@@ -177,7 +177,7 @@ class BaseRunConfig(RunConfig):
 class StabilizerRunConfig(RunConfig):
     """`dyfn-train stabilizer`: DyFN on a frozen base.
 
-    base: a checkpoint of any model. stabilizer: fields of StabilizerConfig. warm_start: go on from
+    base: a checkpoint of any model. stabilizer: fields of DyFNConfig. warm_start: go on from
     the base's own DyFN instead of a fresh one. cache: folder of encoded clips (default:
     OUT/latents); cache_draws: batches of `stages[0].batch` clips in it, 0 for no cache: every
     step then encodes clips of its own; cache_seed: of its draws (default: `seed`);
@@ -220,7 +220,7 @@ class StabilizerRunConfig(RunConfig):
     @field_validator("stabilizer")
     @classmethod
     def _describes_a_stabilizer(cls, value: dict[str, Any]) -> dict[str, Any]:
-        return check_fields(value, StabilizerConfig)
+        return check_fields(value, DyFNConfig)
 
     @field_validator("objective")
     @classmethod

@@ -36,7 +36,7 @@ DOMAINS = 100  # DDS domains whose ports are below the ephemeral range
 
 
 @dataclass(frozen=True)
-class Options:
+class DemoOptions:
     """What to play and where to put the results."""
 
     recording: Path
@@ -46,7 +46,7 @@ class Options:
     domain: int = 1
 
 
-def parse(arguments: Sequence[str] | None = None) -> Options:
+def parse(arguments: Sequence[str] | None = None) -> DemoOptions:
     """Command line -> Options."""
     parser = argparse.ArgumentParser(
         prog="dyfn-demo",
@@ -59,7 +59,7 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     parser.add_argument("--model", default="dyfn-mini")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--domain", type=int, default=1 + os.getpid() % DOMAINS)
-    return Options(**vars(parser.parse_args(arguments)))
+    return DemoOptions(**vars(parser.parse_args(arguments)))
 
 
 def default_recording() -> Path:
@@ -76,7 +76,7 @@ class Run:
     clouds: np.ndarray
 
 
-def demo(options: Options, command: Sequence[str] = NODE_COMMAND) -> dict[str, Run]:
+def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[str, Run]:
     """Play the recording once per run through one live node and write the report.
 
     Raises RecordingError (the recording), LiveError (the node), ImportError (no ROS).
@@ -151,7 +151,7 @@ def _check_cloud(frame: RecordedFrame, depth: np.ndarray, cloud: np.ndarray) -> 
         raise LiveError(f"frame {frame.index}: the cloud's z is not the depth image")
 
 
-def _write(options: Options, recording: Recording, runs: dict[str, Run]) -> None:
+def _write(options: DemoOptions, recording: Recording, runs: dict[str, Run]) -> None:
     evaluations = {name: run.evaluation for name, run in runs.items()}
     results = {name: evaluation.results() for name, evaluation in evaluations.items()}
     out = options.out

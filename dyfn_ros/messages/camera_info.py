@@ -11,7 +11,7 @@ from dyfn_ros.messages.encodings import MessageError
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CameraCalibration:
     """What a CameraInfo says about one image.
 
     matrix: 3 x 3 float64, pixels of the image at hand (binning and region of interest applied).
@@ -38,7 +38,7 @@ def _window(info: Any) -> tuple[int, int, int, int]:
 
 def decode_camera_info(
     info: Any, height: int, width: int, *, rectified: bool = False
-) -> Calibration:
+) -> CameraCalibration:
     """sensor_msgs/CameraInfo -> the intrinsics of an image of height x width pixels.
 
     rectified: take P, which describes rectified images, instead of K.
@@ -65,7 +65,7 @@ def decode_camera_info(
     matrix[0, :2] /= bin_x
     matrix[1, 1] /= bin_y
     d = () if rectified else tuple(float(value) for value in _field(info, "d"))
-    return Calibration(matrix, str(info.distortion_model), d)
+    return CameraCalibration(matrix, str(info.distortion_model), d)
 
 
 def _field(info: Any, name: str) -> Any:

@@ -9,12 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.messages.camera_info import Calibration, decode_camera_info
+from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.images import MessageError
 
 
 @dataclass(frozen=True)
-class View:
+class PinholeImage:
     """An image as a pinhole camera sees it.
 
     image: H x W x 3 uint8 RGB. matrix: 3 x 3 float64 pixels, None when unknown.
@@ -27,11 +27,11 @@ class View:
     matrix: np.ndarray | None = None
     visible: np.ndarray | None = None
     info: Any = None
-    lens: Calibration | None = None
+    lens: CameraCalibration | None = None
 
 
 @dataclass(frozen=True)
-class CalibrationRules:
+class RectifyRules:
     """See the node's parameters of the same names."""
 
     rectified: bool = False
@@ -39,7 +39,7 @@ class CalibrationRules:
     check_frame_id: bool = True
 
 
-class Calibrator:
+class Rectifier:
     """Applies CameraInfos to the images of one camera; keeps the last undistortion.
 
     warn: takes the reason when a CameraInfo is not used. Not for several threads at once.
@@ -50,14 +50,16 @@ class Calibrator:
         self._key: tuple[Any, ...] | None = None
         self._maps: tuple[np.ndarray, np.ndarray, np.ndarray]
 
-    def view(self, image: np.ndarray, frame_id: str, info: Any, rules: CalibrationRules) -> View:
+    def view(
+        self, image: np.ndarray, frame_id: str, info: Any, rules: RectifyRules
+    ) -> PinholeImage:
         """info: sensor_msgs/CameraInfo, or None.
 
         Raises MessageError when the lens is distorted and that is refused, or is of a model that
         cannot be undone. Another unusable info costs the intrinsics only, and a warning.
         """
         if info is None:
-            return View(image)
+            return PinholeImage(image)
         try:
             if rules.check_frame_id:
                 _check_frame_id(frame_id, str(info.header.frame_id))
@@ -65,28 +67,28 @@ class Calibrator:
             calibration = decode_camera_info(info, height, width, rectified=rules.rectified)
         except MessageError as error:
             self._warn(f"{error}; going on without intrinsics")
-            return View(image)
+            return PinholeImage(image)
         if not calibration.distorted or rules.distortion == "ignore":
             if calibration.distorted:
                 self._warn("the lens is distorted (D is not 0), which is ignored")
-            return View(image, calibration.matrix, info=info)
+            return PinholeImage(image, calibration.matrix, info=info)
         if rules.distortion == "refuse":
             raise MessageError(
                 "the lens is distorted (D is not 0) and parameter distortion is refuse"
             )
         return self._undistorted(image, calibration)
 
-    def _undistorted(self, image: np.ndarray, calibration: Calibration) -> View:
+    def _undistorted(self, image: np.ndarray, calibration: CameraCalibration) -> PinholeImage:
         key = (*calibration.matrix.reshape(-1), calibration.model, *calibration.d, *image.shape)
         if key != self._key:
             self._maps = undistortion(calibration, image.shape[0], image.shape[1])
             self._key = key
         columns, rows, visible = self._maps
         flat = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return View(flat, calibration.matrix, visible, lens=calibration)
+        return PinholeImage(flat, calibration.matrix, visible, lens=calibration)
 
 
-def undistort_depth(depth: np.ndarray, view: View) -> np.ndarray:
+def undistort_depth(depth: np.ndarray, view: PinholeImage) -> np.ndarray:
     """Depth registered with the image that a view was made from -> with the view.
 
     depth: H' x W' float32 of the same field of view, NaN invalid; each pixel takes its nearest.
@@ -114,7 +116,7 @@ def _check_frame_id(image: str, info: str) -> None:
 
 
 def undistortion(
-    calibration: Calibration, height: int, width: int
+    calibration: CameraCalibration, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Maps to the pinhole image with the same K: two H x W float32 (columns and rows of the
     source pixels), and H x W bool where those are inside the image.

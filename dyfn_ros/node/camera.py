@@ -15,22 +15,22 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from dyfn_core.stream.scene_cut_hook import SceneCutHook
 from dyfn_core.stream.session import (
     REQUESTED,
-    CameraStream,
     Geometry,
     StreamFrame,
     StreamHook,
+    StreamSession,
     TimeRules,
     stream_maker,
 )
 from dyfn_core.stream.state_hook import StateError, StateHook, path_for
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.images import MessageError, decode_image
-from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View
+from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.node.metric_scale import MetricHook, ScalePorts
 from dyfn_ros.node.outputs import Outputs
 from dyfn_ros.node.parameters.table import Settings
 from dyfn_ros.node.statistics import FrameStatistics
-from dyfn_ros.node.topics import Ports
+from dyfn_ros.node.topics import NodeTopics
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -41,7 +41,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class FrameJob:
     """One image on its way to inference.
 
     info: the newest CameraInfo when the image came. epoch: resets before it came, and request
@@ -71,10 +71,10 @@ class Camera:
     def __init__(
         self,
         node: LifecycleNode,
-        ports: Ports,
+        ports: NodeTopics,
         name: str,
         settings: Callable[[], Settings],
-        submit: Callable[[Job], bool],
+        submit: Callable[[FrameJob], bool],
         release: Callable[[], None],
         warn: Say,
         error: Say,
@@ -84,7 +84,7 @@ class Camera:
         self.statistics = FrameStatistics()
         self.active = False
         self.hooks: list[StreamHook] = []
-        self.stream = CameraStream(_no_model, hooks=self.hooks)
+        self.stream = StreamSession(_no_model, hooks=self.hooks)
         self.outputs = Outputs(ports, self.prefix, not settings().drop_frames)
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
@@ -92,7 +92,7 @@ class Camera:
         self._epoch, self._request = 0, REQUESTED
         self._epoch_lock = threading.Lock()
         self._subscribe(ports)
-        self._calibrator = Calibrator(lambda text: warn(f"{self.info_topic}: {text}"))
+        self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
         self._scale_ports = ScalePorts(ports, self.prefix, self.title, settings())
         self.state: StateHook | None = None  # once there is a model
 
@@ -106,7 +106,7 @@ class Camera:
         """The values in force."""
         return self._settings()
 
-    def _subscribe(self, ports: Ports) -> None:
+    def _subscribe(self, ports: NodeTopics) -> None:
         settings = self.settings
         kind = ReliabilityPolicy.RELIABLE if settings.reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(
@@ -136,7 +136,7 @@ class Camera:
             return
         now = time.monotonic()
         with self._epoch_lock:
-            job = Job(self, message, self._info, self._epoch, self._request, now)
+            job = FrameJob(self, message, self._info, self._epoch, self._request, now)
         if not self._submit(job):
             self._error(
                 f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
@@ -193,7 +193,7 @@ class Camera:
         self.state = StateHook(self.stream, metric, cut, model)
         self.hooks += [cut, metric, self.state]
 
-    def decode(self, job: Job) -> tuple[StreamFrame, View]:
+    def decode(self, job: FrameJob) -> tuple[StreamFrame, PinholeImage]:
         """Raises MessageError when the image, or its lens, cannot be used."""
         settings = self.settings
         compressed = settings.image_transport == "compressed"
@@ -203,7 +203,7 @@ class Camera:
             image,
             header.frame_id,
             job.info or self._info,
-            CalibrationRules(settings.rectified, settings.distortion, settings.check_frame_id),
+            RectifyRules(settings.rectified, settings.distortion, settings.check_frame_id),
         )
         frame = StreamFrame(
             image=view.image,
@@ -224,7 +224,7 @@ class Camera:
         self.stream.rules = TimeRules(settings.stamp_tolerance, settings.max_gap)
         return self.stream.begin(frame)
 
-    def publish(self, job: Job, view: View, geometry: Geometry) -> None:
+    def publish(self, job: FrameJob, view: PinholeImage, geometry: Geometry) -> None:
         """Everything that somebody wants of a finished frame."""
         header = job.message.header
         if geometry.reset:
@@ -237,12 +237,12 @@ class Camera:
             time.monotonic() - job.arrived,
         )
 
-    def bad(self, job: Job, error: MessageError) -> None:
+    def bad(self, job: FrameJob, error: MessageError) -> None:
         """The job's image cannot be used."""
         self.statistics.count("bad")
         self._warn(f"{self.image_topic}: {error}")
 
-    def failed(self, job: Job, error: Exception) -> None:
+    def failed(self, job: FrameJob, error: Exception) -> None:
         """The network, or publishing, failed on the job."""
         self.stream.fail()
         if not self._node.context.ok():  # shut down under our feet: nobody to publish to

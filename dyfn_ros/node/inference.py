@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from dyfn_core.stream.session import StreamFrame
 from dyfn_ros.messages.images import MessageError
-from dyfn_ros.messages.rectify import View
-from dyfn_ros.node.camera import Job
+from dyfn_ros.messages.rectify import PinholeImage
+from dyfn_ros.node.camera import FrameJob
 
 if TYPE_CHECKING:
     from dyfn_core.prediction import Prediction
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Begun:
-    job: Job
+    job: FrameJob
     frame: StreamFrame
-    view: View
+    view: PinholeImage
     stream: DepthStream
 
 
-def run_jobs(jobs: Sequence[Job], batch: bool) -> None:
+def run_jobs(jobs: Sequence[FrameJob], batch: bool) -> None:
     """One job of each camera: decode, infer, publish. What goes wrong costs that job only.
 
     batch: run frames of equal size and settings together.
@@ -40,7 +40,7 @@ def run_jobs(jobs: Sequence[Job], batch: bool) -> None:
         _run_group(group)
 
 
-def _begin(job: Job) -> _Begun | None:
+def _begin(job: FrameJob) -> _Begun | None:
     try:
         frame, view = job.camera.decode(job)
         return _Begun(job, frame, view, job.camera.begin(frame))

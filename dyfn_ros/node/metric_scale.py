@@ -18,10 +18,10 @@ from dyfn_core.stream.session import BACKWARDS, TIME_JUMP, Geometry, StreamFrame
 from dyfn_ros.messages.images import MessageError
 from dyfn_ros.messages.references import parse_transform, reference_decoder
 from dyfn_ros.node.parameters.table import Settings
-from dyfn_ros.node.topics import Ports
+from dyfn_ros.node.topics import NodeTopics
 
 if TYPE_CHECKING:
-    from dyfn_core.metric.calibration import Calibration
+    from dyfn_core.metric.calibration import ScaleCalibration
     from dyfn_core.metric.scale import ScaleInForce, ScaleOptions
 
 _REFERENCE_DEPTH = 20
@@ -33,7 +33,7 @@ class ScalePorts:
     Made on configure, before there is a model; what comes before `listener` is set is not kept.
     """
 
-    def __init__(self, ports: Ports, prefix: str, title: str, settings: Settings) -> None:
+    def __init__(self, ports: NodeTopics, prefix: str, title: str, settings: Settings) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._title = title
         self._scale = ports.publisher(Float64, f"~/{prefix}scale", latched)
@@ -136,11 +136,11 @@ class MetricHook(StreamHook):
         ports.listener = self._on_reference
 
     @property
-    def state(self) -> Calibration:
+    def state(self) -> ScaleCalibration:
         """What the calibration remembers."""
         return self.scale.calibrator.state
 
-    def restore(self, state: Calibration | None) -> None:
+    def restore(self, state: ScaleCalibration | None) -> None:
         """Go on from a remembered calibration; None starts anew."""
         self.scale.reset()
         if state is not None:

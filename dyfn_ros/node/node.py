@@ -17,13 +17,13 @@ from std_srvs.srv import Trigger
 
 from dyfn_core.stream.session import REQUESTED, TIME_JUMP
 from dyfn_core.stream.state_hook import StateError
-from dyfn_ros.node.camera import Camera, Job
+from dyfn_ros.node.camera import Camera, FrameJob
 from dyfn_ros.node.diagnostics import Report, node_diagnostics
 from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.parameters.declare import NodeParameters
 from dyfn_ros.node.parameters.table import Settings
-from dyfn_ros.node.topics import Ports
+from dyfn_ros.node.topics import NodeTopics
 from dyfn_ros.node.worker import FrameWorker
 
 if TYPE_CHECKING:
@@ -56,11 +56,11 @@ class StreamDepthNode(LifecycleNode):
         self._throttle = Throttle()
         self._phase = "unconfigured"
         self._device = ""
-        self._worker: FrameWorker[Job] | None = None
+        self._worker: FrameWorker[FrameJob] | None = None
         self._cameras: list[Camera] = []
         self._made: list[Callable[[], Any]] = []  # what cleanup undoes
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
-        self._ports = Ports(self, self._warn)
+        self._ports = NodeTopics(self, self._warn)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
             "/diagnostics",

@@ -17,7 +17,7 @@ from dyfn_ros.messages.clouds import cloud_message, pack_cloud
 from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
 from dyfn_ros.messages.images import colour_message, compressed_message, depth_message
 from dyfn_ros.node.parameters.table import Settings
-from dyfn_ros.node.topics import Ports
+from dyfn_ros.node.topics import NodeTopics
 
 _OUTPUT_DEPTH = 5
 _LOSSLESS_DEPTH = 100  # a cloud of 640 x 480 is 10 MB
@@ -30,7 +30,7 @@ class Outputs:
     prefix: "" or "CAMERA/", before each of these names. The inference thread publishes.
     """
 
-    def __init__(self, ports: Ports, prefix: str, lossless: bool) -> None:
+    def __init__(self, ports: NodeTopics, prefix: str, lossless: bool) -> None:
         depth = _LOSSLESS_DEPTH if lossless else _OUTPUT_DEPTH
         qos = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST)
         latched = QoSProfile(

@@ -12,7 +12,7 @@ from rclpy.qos import QoSProfile, qos_policy_name_from_kind
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 
-class Ports:
+class NodeTopics:
     """Makes a node's topics and destroys them together."""
 
     def __init__(self, node: LifecycleNode, warn: Callable[[str], None]) -> None:

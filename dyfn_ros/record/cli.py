@@ -17,7 +17,7 @@ from dyfn_core.argument_types import at_least_one, finite_above_zero
 from dyfn_ros.record.camera_yaml import read_camera_yaml
 from dyfn_ros.record.sources import folder_frames, video_frames
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.rgbd_writer import ColourEncoding, RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import ColourEncoding, FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import Lens
 from dyfn_ros.recordings.writer import STORAGES, DepthEncoding
 
@@ -26,7 +26,7 @@ LENSES = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial"}
 
 
 @dataclass(frozen=True)
-class Options:
+class RecordOptions:
     """What to make a recording of and how; see the command's --help."""
 
     source: Path
@@ -47,7 +47,7 @@ class Options:
     frame_id: str = "camera_optical"
 
 
-def parse(arguments: Sequence[str] | None = None) -> Options:
+def parse(arguments: Sequence[str] | None = None) -> RecordOptions:
     """Command line -> Options; ends the process with code 2 on a wrong one."""
     parser = argparse.ArgumentParser(
         prog="dyfn-record",
@@ -76,10 +76,10 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     given = vars(parser.parse_args(arguments))
     for name in ("intrinsics", "distortion"):
         given[name] = None if given[name] is None else tuple(given[name])
-    return Options(**given)
+    return RecordOptions(**given)
 
 
-def make_recording(options: Options) -> tuple[int, Counter[str]]:
+def make_recording(options: RecordOptions) -> tuple[int, Counter[str]]:
     """Write the recording; -> frames in it, and what was left out, by reason.
 
     Raises RecordingError (source, output path, options that do not fit) and OutputError (disk).
@@ -100,7 +100,7 @@ def make_recording(options: Options) -> tuple[int, Counter[str]]:
     return count, left_out
 
 
-def _frames(options: Options, left_out: Counter[str]) -> Iterator[RgbdFrame]:
+def _frames(options: RecordOptions, left_out: Counter[str]) -> Iterator[FrameToRecord]:
     def warn(reason: str) -> None:
         left_out[reason] += 1
 
@@ -124,7 +124,7 @@ def _frames(options: Options, left_out: Counter[str]) -> Iterator[RgbdFrame]:
     return video_frames(source, warn, _matrix(options), _lens(options), camera)
 
 
-def _matrix(options: Options) -> np.ndarray | None:
+def _matrix(options: RecordOptions) -> np.ndarray | None:
     if options.intrinsics is None:
         return None
     fx, fy, cx, cy = options.intrinsics
@@ -133,7 +133,7 @@ def _matrix(options: Options) -> np.ndarray | None:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def _lens(options: Options) -> Lens | None:
+def _lens(options: RecordOptions) -> Lens | None:
     values = options.distortion
     if values is None:
         return None

@@ -16,7 +16,7 @@ from dyfn_core.geometry.camera import pixel_intrinsics
 from dyfn_ros.record.camera_yaml import CameraYaml
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_rgbd_folder
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.typestore import Lens
 
 PLAIN_RATE, SENSOR_RATE = 10.0, 30.0  # frames a second of folders without stamps
@@ -29,7 +29,7 @@ def folder_frames(
     rate: float | None = None,
     intrinsics: tuple[float, float, float, float] | None = None,
     depth_scale: float | None = None,
-) -> Iterator[RgbdFrame]:
+) -> Iterator[FrameToRecord]:
     """Frames of one RGB-D folder: rgb/, depth/, K.txt; TUM; 7-Scenes; a ScanNet export.
 
     Stamps: TUM's own; else the frames' numbers over `rate` a second (10 for the plain layout,
@@ -54,7 +54,7 @@ def folder_frames(
         normalised = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         matrix = pixel_intrinsics(normalised, frame.image.shape[:2])
         stamp = (number - first) / rate if frame.stamp is None else frame.stamp
-        yield RgbdFrame(frame.image, frame.depth, matrix, frame.pose, stamp)
+        yield FrameToRecord(frame.image, frame.depth, matrix, frame.pose, stamp)
 
 
 def _one_sequence(
@@ -92,7 +92,7 @@ def video_frames(
     matrix: np.ndarray | None = None,
     lens: Lens | None = None,
     camera: CameraYaml | None = None,
-) -> Iterator[RgbdFrame]:
+) -> Iterator[FrameToRecord]:
     """Frames of a video file that OpenCV can decode, stamped with their own times from its start.
 
     matrix: 3 x 3 intrinsics in pixels of the frames as they are shown (turned upright); lens:
@@ -115,7 +115,7 @@ def video_frames(
                 raise RecordingError(f"{path}: frame {count} at {stamp} s comes after {last} s")
             count, last = count + 1, stamp
             image = np.ascontiguousarray(pixels[..., ::-1])
-            yield RgbdFrame(image, None, matrix, None, stamp, lens)
+            yield FrameToRecord(image, None, matrix, None, stamp, lens)
     finally:
         video.release()
     if count == 0:

@@ -11,11 +11,11 @@ from dyfn_core.evaluation.benchmarks.predictions import scored_values
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.projection import back_project, render_depth, resized_camera
 from dyfn_core.prediction import DEPTH, DISPARITY
-from dyfn_ros.messages.camera_info import Calibration, decode_camera_info
+from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_depth
-from dyfn_ros.messages.rectify import View, undistort_depth
+from dyfn_ros.messages.rectify import PinholeImage, undistort_depth
 from dyfn_ros.messages.references import Transform, decode_points
 from dyfn_ros.recordings.storage.base import Recorded
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, POINT_CLOUD
@@ -44,7 +44,9 @@ class GroundTruth:
         self._warn = warn
         self._quantity = quantity
 
-    def decode(self, recorded: Recorded, info: Any, view: View, frame_id: str) -> np.ndarray:
+    def decode(
+        self, recorded: Recorded, info: Any, view: PinholeImage, frame_id: str
+    ) -> np.ndarray:
         """H x W float32 metres along the optical axis of the view, NaN where there is none.
 
         info: CameraInfo of the depth image, or None. view, frame_id: the image's. The result has
@@ -70,7 +72,7 @@ class GroundTruth:
             )
         self._check_place(message, frame_id, "at the image's optical centre")
         if calibration.distorted:
-            lens = View(np.empty((*depth.shape, 0)), calibration.matrix, lens=calibration)
+            lens = PinholeImage(np.empty((*depth.shape, 0)), calibration.matrix, lens=calibration)
             depth = undistort_depth(depth, lens)
         size = (view.image.shape[0], view.image.shape[1])
         return register_depth(depth, calibration.matrix, view.matrix, size, self._transform)
@@ -81,7 +83,7 @@ class GroundTruth:
         stored = decode_depth(message, zero=self._quantity == DISPARITY)
         return scored_values(stored, self._quantity)
 
-    def _cloud(self, message: Any, view: View, frame_id: str) -> np.ndarray:
+    def _cloud(self, message: Any, view: PinholeImage, frame_id: str) -> np.ndarray:
         if view.matrix is None:
             raise MessageError("a point cloud needs the intrinsics of the image")
         points = decode_points(message)
@@ -90,7 +92,7 @@ class GroundTruth:
             points = self._transform(points)
         return render_depth(points, view.matrix, (view.image.shape[0], view.image.shape[1]))
 
-    def _calibration(self, info: Any, depth: np.ndarray) -> Calibration | None:
+    def _calibration(self, info: Any, depth: np.ndarray) -> CameraCalibration | None:
         if info is None:
             return None
         try:
@@ -105,12 +107,12 @@ class GroundTruth:
             self._warn(f"frame {own!r} taken to be {assumed} ({frame_id!r}): no transform given")
 
 
-def _same_camera(calibration: Calibration, depth: np.ndarray, view: View) -> bool:
+def _same_camera(calibration: CameraCalibration, depth: np.ndarray, view: PinholeImage) -> bool:
     """Whether depth and image are of one camera, but for the resolution."""
     assert view.matrix is not None
     ours = normalize_intrinsics(view.matrix, (view.image.shape[0], view.image.shape[1]))
     theirs = normalize_intrinsics(calibration.matrix, (depth.shape[0], depth.shape[1]))
-    lens = view.lens or Calibration(view.matrix)
+    lens = view.lens or CameraCalibration(view.matrix)
     if lens.distorted != calibration.distorted:
         return False
     same_lens = not lens.distorted or (lens.model, lens.d) == (calibration.model, calibration.d)

@@ -16,8 +16,8 @@ from dyfn_ros.recordings.rgbd_folder import (
     numbered,
     read_rgbd_folder,
 )
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
-from dyfn_ros.recordings.ros import RosRecording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
+from dyfn_ros.recordings.ros import BagRecording
 from dyfn_ros.recordings.storage.base import Recorded
 from dyfn_ros.recordings.storage.open import open_storage
 from dyfn_ros.recordings.topics import Topics, choose_topics
@@ -34,11 +34,11 @@ from dyfn_ros.recordings.writer import RecordingWriter
 
 __all__ = [
     "FolderRecording",
+    "FrameToRecord",
     "RecordedFrame",
     "Recording",
     "RecordingError",
     "RecordingWriter",
-    "RgbdFrame",
     "image_topics",
     "open_recording",
     "write_rgbd_recording",
@@ -89,7 +89,7 @@ def open_recording(
         raise RecordingError(
             f"{path}: {topics.depth} is {POINT_CLOUD}, expected images of {quantity}"
         )
-    return RosRecording(path, storage, topics, tolerance, transform, stamps, quantity)
+    return BagRecording(path, storage, topics, tolerance, transform, stamps, quantity)
 
 
 def image_topics(path: str | Path) -> list[str | None]:

@@ -33,7 +33,7 @@ class PoseError(RecordingError):
 
 
 @dataclass
-class Track:
+class PoseTrack:
     """The pose of one thing over time; stamps may come in any order."""
 
     stamps: list[int] = field(default_factory=list)
@@ -79,7 +79,7 @@ def _between(first: np.ndarray, second: np.ndarray, ends: np.ndarray, stamp: int
 class TransformTree:
     """Child frame -> its parent and where it is in it, over time or for ever (static)."""
 
-    moving: dict[str, tuple[str, Track]] = field(default_factory=dict)
+    moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
     static: dict[str, tuple[str, np.ndarray]] = field(default_factory=dict)
 
     def add(self, transform: Any, static: bool) -> None:
@@ -90,16 +90,16 @@ class TransformTree:
             self.static[child] = (parent, pose)
         else:
             known = self.moving.get(child)
-            track = Track() if known is None or known[0] != parent else known[1]
+            track = PoseTrack() if known is None or known[0] != parent else known[1]
             self.moving[child] = (parent, track)
             track.add(_nanoseconds(transform.header), pose)
 
-    def chain(self, frame: str) -> list[Track | np.ndarray]:
+    def chain(self, frame: str) -> list[PoseTrack | np.ndarray]:
         """What leads from a frame up to its root, the frame's own transform first."""
-        links: list[Track | np.ndarray] = []
+        links: list[PoseTrack | np.ndarray] = []
         seen = {frame}
         while frame in self.moving or frame in self.static:
-            link: Track | np.ndarray
+            link: PoseTrack | np.ndarray
             frame, link = self.moving[frame] if frame in self.moving else self.static[frame]
             links.append(link)
             if frame in seen:
@@ -120,10 +120,10 @@ class TransformTree:
         return None
 
 
-def _at(links: list[Track | np.ndarray], stamp_ns: int) -> np.ndarray | None:
+def _at(links: list[PoseTrack | np.ndarray], stamp_ns: int) -> np.ndarray | None:
     pose = np.eye(4)
     for link in links:
-        here = link.at(stamp_ns) if isinstance(link, Track) else link
+        here = link.at(stamp_ns) if isinstance(link, PoseTrack) else link
         if here is None:
             return None
         pose = here @ pose
@@ -153,7 +153,7 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
         raise PoseError(f"{path}: no topic {topic} of poses, odometry or TF: {_listing(kinds)}")
     if topic is None or kinds[topic] == TF:
         links = tree.chain(_name(frame_id))
-        if any(isinstance(link, Track) for link in links):
+        if any(isinstance(link, PoseTrack) for link in links):
             return lambda index, stamp_ns: _at(links, stamp_ns)
         if topic is not None:
             raise PoseError(f"{path}: {topic} does not say where {frame_id!r} moves")
@@ -185,8 +185,8 @@ def _read_tree(storage: Storage, kinds: dict[str, str]) -> TransformTree:
 
 def _read_track(
     storage: Storage, topic: str, kind: str, frame_id: str, tree: TransformTree
-) -> Track:
-    track = Track()
+) -> PoseTrack:
+    track = PoseTrack()
     for recorded in storage.messages([topic]):
         message = recorded.message()
         pose = message.pose if kind == POSE else message.pose.pose

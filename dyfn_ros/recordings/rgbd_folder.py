@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
@@ -28,7 +28,7 @@ def numbered(folder: Path, suffixes: set[str]) -> list[Path]:
 
 def read_rgbd_folder(
     path: str | Path, rate: float = 10.0, lose: Callable[[str], None] | None = None
-) -> Iterator[RgbdFrame]:
+) -> Iterator[FrameToRecord]:
     """Frames of `rgb/*.jpg|png` with `depth/<same name>.png`, stamped 0, 1/rate, 2/rate ...
 
     depth: uint16 millimetres, 0 = none. `K.txt`: 3 x 3 intrinsics in pixels. `poses.txt`: a
@@ -46,7 +46,7 @@ def read_rgbd_folder(
         image = _attempt(_colour, file, lose)
         if image is None:
             continue
-        yield RgbdFrame(
+        yield FrameToRecord(
             image=image,
             depth_m=_attempt(_depth, folder / "depth" / f"{file.stem}.png", lose),
             camera_matrix=camera_matrix,

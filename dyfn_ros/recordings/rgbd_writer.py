@@ -17,7 +17,7 @@ ColourEncoding = Literal["jpeg", "png", "raw"]
 
 
 @dataclass(frozen=True)
-class RgbdFrame:
+class FrameToRecord:
     """One moment of an RGB-D recording.
 
     image: H x W x 3 uint8, RGB.
@@ -45,7 +45,7 @@ class RgbdFrame:
 
 def write_rgbd_recording(
     path: str | Path,
-    frames: Iterable[RgbdFrame],
+    frames: Iterable[FrameToRecord],
     *,
     storage: str | None = None,
     overwrite: bool = False,

@@ -13,7 +13,7 @@ from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_image
-from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View
+from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
 from dyfn_ros.recordings.depth_matching import Stamped, match_depth
 from dyfn_ros.recordings.errors import RecordingError
@@ -24,7 +24,7 @@ from dyfn_ros.recordings.topics import Topics
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 
 
-class RosRecording:
+class BagRecording:
     """Frames of a recording of ROS messages."""
 
     def __init__(
@@ -40,7 +40,7 @@ class RosRecording:
         self.path = path
         self.topics = topics
         self.notes = Notes()
-        self._rules = CalibrationRules()
+        self._rules = RectifyRules()
         self._storage = storage
         self._tolerance_ns = round(tolerance * 1e9)
         self._truth = GroundTruth(transform, self._assumed, quantity)
@@ -56,7 +56,7 @@ class RosRecording:
         self.notes = Notes()
         infos = _Infos(self._first(self.topics.camera_info), self._unusable)
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
-        calibrator = Calibrator(self._unusable)
+        calibrator = Rectifier(self._unusable)
         index, last = 0, -1
         for image, depth in self._pairs():
             infos.recorded = image.info or infos.recorded
@@ -120,7 +120,7 @@ class RosRecording:
         depth: Stamped | None,
         infos: _Infos,
         depth_infos: _Infos,
-        calibrator: Calibrator,
+        calibrator: Rectifier,
     ) -> RecordedFrame | None:
         message = image.recorded.message()
         frame_id = str(message.header.frame_id)
@@ -144,7 +144,7 @@ class RosRecording:
         )
 
     def _decode_depth(
-        self, depth: Stamped | None, info: Any, view: View, frame_id: str
+        self, depth: Stamped | None, info: Any, view: PinholeImage, frame_id: str
     ) -> np.ndarray | None:
         if depth is None:
             if self.topics.depth is not None:

@@ -20,8 +20,8 @@ from dyfn_core.files import finished_file
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
 from dyfn_ros.replay.batch_summary import Row, write_summary
-from dyfn_ros.replay.jobs import CRASHED, Job, Outcome, Runner, run_one
-from dyfn_ros.replay.options import Options, split
+from dyfn_ros.replay.jobs import CRASHED, Outcome, ReplayJob, Runner, run_one
+from dyfn_ros.replay.options import ReplayOptions, split
 from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, ModelLoader, load
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ FREE_OPTIONS = ("recording", "out", "progress")
 
 
 @dataclass(frozen=True)
-class FleetOptions:
+class BatchOptions:
     """jobs: worker processes here. ray: a cluster's address, "local" for one made here, or None."""
 
     jobs: int = 1
@@ -95,9 +95,9 @@ def _is_recording(folder: Path) -> bool:
     return len(parts) == 1 and not any(f.is_dir() and _is_recording(f) for f in folder.iterdir())
 
 
-def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Job]:
+def plan(recordings: Sequence[Path], options: ReplayOptions, checksum: str) -> list[ReplayJob]:
     """A job per recording and image topic, each with a folder of its own under options.out."""
-    jobs: list[Job] = []
+    jobs: list[ReplayJob] = []
     taken: set[str] = set()
     for recording in recordings:
         path = recording.absolute()  # a link keeps its own name
@@ -111,18 +111,18 @@ def plan(recordings: Sequence[Path], options: Options, checksum: str) -> list[Jo
         own = replace(options, recording=path, out=options.out.absolute() / free, progress=False)
         for one in _topics(own):
             part = one.out.relative_to(own.out)
-            jobs.append(Job(str(Path(free) / part), one, _key(one, checksum)))
+            jobs.append(ReplayJob(str(Path(free) / part), one, _key(one, checksum)))
     return jobs
 
 
-def _topics(options: Options) -> list[Options]:
+def _topics(options: ReplayOptions) -> list[ReplayOptions]:
     try:
         return split(options)
     except RecordingError:  # the replay of it says why, and the others go on
         return [options]
 
 
-def _key(options: Options, checksum: str) -> str:
+def _key(options: ReplayOptions, checksum: str) -> str:
     """Of the options, the model's weights, and the recording's files, sizes and times."""
     path = options.recording
     files = sorted(f for f in path.rglob("*") if f.is_file()) if path.is_dir() else [path]
@@ -143,8 +143,8 @@ def model_checksum(model: GeometryModel) -> str:
 
 def replay_all(
     recordings: Sequence[Path],
-    options: Options,
-    fleet: FleetOptions,
+    options: ReplayOptions,
+    fleet: BatchOptions,
     loader: ModelLoader = load,
 ) -> int:
     """Replay every recording into its own folder and write the summary over all; -> exit code.
@@ -177,7 +177,7 @@ def replay_all(
     return ALL if codes == {ALL} else PARTIAL
 
 
-def _runner(fleet: FleetOptions) -> Runner:
+def _runner(fleet: BatchOptions) -> Runner:
     if fleet.ray is not None:
         from dyfn_ros.replay.batch_ray import ray_runner
 
@@ -185,7 +185,7 @@ def _runner(fleet: FleetOptions) -> Runner:
     return lambda jobs, loader: run_locally(jobs, loader, fleet.jobs)
 
 
-def _finished(job: Job) -> Outcome | None:
+def _finished(job: ReplayJob) -> Outcome | None:
     """What is remembered of an earlier run that gave results of the same key."""
     try:
         known = json.loads((job.options.out / "outcome.json").read_text(encoding="utf-8"))
@@ -196,14 +196,14 @@ def _finished(job: Job) -> Outcome | None:
         return None
 
 
-def _remember(job: Job, outcome: Outcome) -> None:
+def _remember(job: ReplayJob, outcome: Outcome) -> None:
     job.options.out.mkdir(parents=True, exist_ok=True)
     known = {"key": job.key, "recording": str(job.options.recording), **asdict(outcome)}
     with finished_file(job.options.out / "outcome.json") as partial:
         partial.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
 
 
-def _row(job: Job, outcome: Outcome) -> Row:
+def _row(job: ReplayJob, outcome: Outcome) -> Row:
     metrics: dict[str, Any] = {}
     if outcome.code in USABLE:
         metrics = json.loads((job.options.out / "metrics.json").read_text(encoding="utf-8"))
@@ -211,8 +211,8 @@ def _row(job: Job, outcome: Outcome) -> Row:
 
 
 def run_locally(
-    jobs: Sequence[Job], loader: ModelLoader, workers: int
-) -> Iterator[tuple[Job, Outcome]]:
+    jobs: Sequence[ReplayJob], loader: ModelLoader, workers: int
+) -> Iterator[tuple[ReplayJob, Outcome]]:
     """A fresh process for each, `workers` at a time: one that dies takes no other along."""
     alive: set[Any] = set()
     with ThreadPoolExecutor(max(1, workers)) as pool:
@@ -227,7 +227,7 @@ def run_locally(
                 process.terminate()
 
 
-def _in_process(options: Options, loader: ModelLoader, alive: set[Any]) -> Outcome:
+def _in_process(options: ReplayOptions, loader: ModelLoader, alive: set[Any]) -> Outcome:
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(sender, options, loader), daemon=True)
@@ -245,5 +245,5 @@ def _in_process(options: Options, loader: ModelLoader, alive: set[Any]) -> Outco
     return outcome
 
 
-def _work(sender: Connection, options: Options, loader: ModelLoader) -> None:
+def _work(sender: Connection, options: ReplayOptions, loader: ModelLoader) -> None:
     sender.send(run_one(options, loader))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from dyfn_core.files import OutputError
-from dyfn_ros.replay.jobs import CRASHED, Job, Outcome, Runner, run_one
+from dyfn_ros.replay.jobs import CRASHED, Outcome, ReplayJob, Runner, run_one
 from dyfn_ros.replay.run import ModelLoader
 
 LOCAL = "local"  # Ray's own word for a cluster of this machine, made for this run
@@ -26,7 +26,9 @@ def ray_runner(address: str, jobs: int = 1) -> Runner:
             f"--ray needs Ray ({error}): install this package with its `ray` extra"
         ) from error
 
-    def run(waiting: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
+    def run(
+        waiting: Sequence[ReplayJob], loader: ModelLoader
+    ) -> Iterator[tuple[ReplayJob, Outcome]]:
         if not waiting:
             return
         cpus = jobs * max(job.options.threads or 1 for job in waiting)
@@ -44,7 +46,9 @@ def ray_runner(address: str, jobs: int = 1) -> Runner:
     return run
 
 
-def _outcomes(ray: Any, jobs: Sequence[Job], loader: ModelLoader) -> Iterator[tuple[Job, Outcome]]:
+def _outcomes(
+    ray: Any, jobs: Sequence[ReplayJob], loader: ModelLoader
+) -> Iterator[tuple[ReplayJob, Outcome]]:
     tasks = {}
     for job in jobs:
         needs = {"num_cpus": job.options.threads, "num_gpus": int("cuda" in job.options.device)}

@@ -12,7 +12,7 @@ from dyfn_core.evaluation.sequence import score_table
 from dyfn_ros.recordings.open import (
     RecordingError,
 )
-from dyfn_ros.replay.options import Command, Options, parse, split
+from dyfn_ros.replay.options import Command, ReplayOptions, parse, split
 from dyfn_ros.replay.outputs import FILES
 from dyfn_ros.replay.results import results_by_name
 
@@ -39,14 +39,14 @@ def _replay_command(command: Command, loader: ModelLoader) -> int:
     from dyfn_ros.replay import batch as fleet
 
     if fleet.is_many(command.recordings):
-        chosen = fleet.FleetOptions(command.jobs, command.ray)
+        chosen = fleet.BatchOptions(command.jobs, command.ray)
         recordings = fleet.expand(command.recordings)
         return fleet.replay_all(recordings, command.options, chosen, loader)
     codes = {_replay_and_tell(one, loader) for one in split(command.options)}
     return codes.pop() if len(codes) == 1 else PARTIAL
 
 
-def _replay_and_tell(options: Options, loader: ModelLoader) -> int:
+def _replay_and_tell(options: ReplayOptions, loader: ModelLoader) -> int:
     try:
         metrics = replay(options, loader)
     except (RecordingError, ValueError, OSError) as error:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.replay.options import Options
+from dyfn_ros.replay.options import ReplayOptions
 from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, ModelLoader, replay
 
 if TYPE_CHECKING:
@@ -19,14 +19,14 @@ CRASHED = 1  # the code of a recording whose worker died, or failed in a way tha
 
 
 @dataclass(frozen=True)
-class Job:
+class ReplayJob:
     """One image topic of a recording to replay.
 
     name: of its folder and row. key: of all that decides the result.
     """
 
     name: str
-    options: Options
+    options: ReplayOptions
     key: str
 
 
@@ -40,10 +40,10 @@ class Outcome:
 
 
 # Runs jobs and gives each with its outcome, in any order.
-Runner = Callable[[Sequence[Job], ModelLoader], Iterator[tuple[Job, Outcome]]]
+Runner = Callable[[Sequence[ReplayJob], ModelLoader], Iterator[tuple[ReplayJob, Outcome]]]
 
 
-def run_one(options: Options, loader: ModelLoader) -> Outcome:
+def run_one(options: ReplayOptions, loader: ModelLoader) -> Outcome:
     """Replay one recording; every exception becomes an outcome."""
     try:
         metrics = replay(options, loader)

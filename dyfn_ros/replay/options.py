@@ -18,7 +18,7 @@ from dyfn_ros.replay.outputs import DEFAULT, FILES, VOXEL, parse_outputs
 
 
 @dataclass(frozen=True)
-class Options:
+class ReplayOptions:
     """What to replay and how; see the command's --help."""
 
     recording: Path
@@ -58,13 +58,13 @@ class Command:
     jobs, ray: see fleet.FleetOptions.
     """
 
-    options: Options
+    options: ReplayOptions
     recordings: tuple[Path, ...]
     jobs: int
     ray: str | None
 
 
-def split(options: Options) -> list[Options]:
+def split(options: ReplayOptions) -> list[ReplayOptions]:
     """One Options per image topic when there are several, each with a folder of its own.
 
     Raises RecordingError as image_topics does.
@@ -125,7 +125,7 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
         given["image_topic"] = topics[0]
     else:
         given["image_topics"] = topics
-    return Command(Options(recordings[0], **given), tuple(recordings), jobs, ray)
+    return Command(ReplayOptions(recordings[0], **given), tuple(recordings), jobs, ray)
 
 
 def _add_model_options(parser: argparse.ArgumentParser) -> None:

@@ -19,7 +19,7 @@ from dyfn_core.files import finished_file
 from dyfn_ros.recordings.open import Recording
 
 if TYPE_CHECKING:
-    from dyfn_ros.replay.options import Options
+    from dyfn_ros.replay.options import ReplayOptions
 
 
 CONTROLS_NOTE = (
@@ -46,7 +46,7 @@ class Result:
     cloud: np.ndarray | None
 
 
-def write_results(options: Options, result: Result) -> dict[str, Any]:
+def write_results(options: ReplayOptions, result: Result) -> dict[str, Any]:
     """Write scores, table, strip and report into options.out; -> metrics.json's content.
 
     Raises OutputError.
@@ -64,7 +64,7 @@ def write_results(options: Options, result: Result) -> dict[str, Any]:
     return metrics
 
 
-def _metrics(options: Options, result: Result) -> dict[str, Any]:
+def _metrics(options: ReplayOptions, result: Result) -> dict[str, Any]:
     recording = result.recording
     results = result.evaluation.results()
     return {
@@ -102,7 +102,9 @@ def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
         writer.writerows(evaluation.rows())
 
 
-def _write_report(path: Path, options: Options, metrics: dict[str, Any], result: Result) -> None:
+def _write_report(
+    path: Path, options: ReplayOptions, metrics: dict[str, Any], result: Result
+) -> None:
     facts: list[list[str | float | int | None]] = [
         ["recording", str(options.recording)],
         ["frames", metrics["frames"]],

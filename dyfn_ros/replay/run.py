@@ -19,7 +19,7 @@ from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.prediction import DEPTH
 from dyfn_core.scoring.protocols import FrameScore, SequenceScorer, predicted, to_shape
 from dyfn_core.stream.scene_cut_hook import SceneCutHook
-from dyfn_core.stream.session import CameraStream, StreamFrame, stream_maker
+from dyfn_core.stream.session import StreamFrame, StreamSession, stream_maker
 from dyfn_core.threads import computing_threads
 from dyfn_ros.recordings.open import (
     FolderRecording,
@@ -28,7 +28,7 @@ from dyfn_ros.recordings.open import (
     RecordingError,
     open_recording,
 )
-from dyfn_ros.replay.options import Options
+from dyfn_ros.replay.options import ReplayOptions
 from dyfn_ros.replay.outputs import OutputOptions, ReplayOutputs
 from dyfn_ros.replay.results import Result, write_results
 from dyfn_ros.replay.video import Alignment
@@ -47,7 +47,7 @@ def load(name: str, device: str) -> GeometryModel:
     return load_model(name, device=device)
 
 
-def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
+def replay(options: ReplayOptions, loader: ModelLoader = load) -> dict[str, Any]:
     """Replay one image topic and write everything into options.out; -> metrics.json's content.
 
     With a prediction_topic no model runs: its images are scored. Raises RecordingError for a
@@ -74,13 +74,15 @@ def replay(options: Options, loader: ModelLoader = load) -> dict[str, Any]:
     return write_results(options, result)
 
 
-def _require_frames(options: Options, recording: Recording, evaluation: SequenceEvaluation) -> None:
+def _require_frames(
+    options: ReplayOptions, recording: Recording, evaluation: SequenceEvaluation
+) -> None:
     if evaluation.frames == 0:
         reasons = "; ".join(recording.notes.losses) or "it holds no frames"
         raise RecordingError(f"{options.recording}: no frame could be used: {reasons}")
 
 
-def score_topic(options: Options, recording: Recording) -> SequenceEvaluation:
+def score_topic(options: ReplayOptions, recording: Recording) -> SequenceEvaluation:
     """What some method recorded on prediction_topic, matched and registered as truth is.
 
     Its quantity is aligned as `dyfn-eval score` aligns that of files. Images without a prediction
@@ -111,7 +113,7 @@ def score_topic(options: Options, recording: Recording) -> SequenceEvaluation:
     return evaluation
 
 
-def _prediction_topic(options: Options, recording: Recording, predicted_by: Recording) -> str:
+def _prediction_topic(options: ReplayOptions, recording: Recording, predicted_by: Recording) -> str:
     """As it is recorded. Raises RecordingError when its scores would say nothing."""
     topic = predicted_by.topics.depth
     if isinstance(recording, FolderRecording) or topic is None:
@@ -155,7 +157,7 @@ def _push(
         raise RecordingError(f"{recording.topics.depth}: {error}") from error
 
 
-def _open(options: Options, quantity: str = DEPTH) -> Recording:
+def _open(options: ReplayOptions, quantity: str = DEPTH) -> Recording:
     return open_recording(
         options.recording,
         options.image_topic,
@@ -169,14 +171,14 @@ def _open(options: Options, quantity: str = DEPTH) -> Recording:
     )
 
 
-def _run_base(options: Options, model: GeometryModel) -> SequenceEvaluation | None:
+def _run_base(options: ReplayOptions, model: GeometryModel) -> SequenceEvaluation | None:
     """The same frames without DyFN, nothing but their evaluation kept; None without DyFN."""
     if not options.stabilizer or model.stabilizer is None:
         return None
     return _run(replace(options, stabilizer=False), _open(options), model)
 
 
-def _run_controls(options: Options, model: GeometryModel) -> dict[str, SequenceScorer]:
+def _run_controls(options: ReplayOptions, model: GeometryModel) -> dict[str, SequenceScorer]:
     """The same frames with each of latent_controls in DyFN's place."""
     from dyfn_core.models.controls import latent_controls, stabilized_by
 
@@ -188,7 +190,7 @@ def _run_controls(options: Options, model: GeometryModel) -> dict[str, SequenceS
     return found
 
 
-def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
+def _frames(options: ReplayOptions, recording: Recording) -> tuple[Iterator[RecordedFrame], int]:
     """The frames to use, and how many there will be if none is lost."""
     available = math.ceil(recording.expected_frames / options.stride)
     expected = min(available, options.max_frames or available)
@@ -197,13 +199,13 @@ def _frames(options: Options, recording: Recording) -> tuple[Iterator[RecordedFr
 
 
 def _run(
-    options: Options,
+    options: ReplayOptions,
     recording: Recording,
     model: GeometryModel,
     outputs: ReplayOutputs | None = None,
 ) -> SequenceEvaluation:
     cuts = SceneCutHook(lambda: options.scene_cut_threshold)
-    camera = CameraStream(stream_maker(model), hooks=[cuts])
+    camera = StreamSession(stream_maker(model), hooks=[cuts])
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
     with outputs or nullcontext():
@@ -236,7 +238,7 @@ def _run(
     return evaluation
 
 
-def _outputs_of(options: Options, recording: Recording) -> ReplayOutputs:
+def _outputs_of(options: ReplayOptions, recording: Recording) -> ReplayOutputs:
     chosen = OutputOptions(options.write, options.pose_topic, options.voxel, options.depth_max)
 
     def warn(reason: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.render.renderer import RenderCamera
 from dyfn_worlds.scene.scene import Scene
 
 FAR = 200.0
@@ -114,7 +114,7 @@ class Lens:
 
 def random_view(
     space: FreeSpace, rng: np.random.Generator, lens: Lens, interests: np.ndarray
-) -> Camera:
+) -> RenderCamera:
     """One camera at head or robot height that looks about level, more often down than up.
 
     interests: N x 3; two views in three look at one of them from 0.6 to 4 m, or past it: a plant
@@ -131,12 +131,12 @@ def random_view(
     position = space.sample_point(rng, (0.7, 2.0) if rng.random() < 0.8 else (0.25, 0.7))
     pitch = np.radians(np.clip(rng.normal(-10, 13), -65, 35))
     roll = np.radians(rng.normal(0, 4))
-    return Camera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
+    return RenderCamera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
 
 
 def _view_past(
     space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
-) -> Camera | None:
+) -> RenderCamera | None:
     """A camera with a point near one side of its picture and free space ahead; None if there is
     none."""
     for _ in range(12):
@@ -151,13 +151,13 @@ def _view_past(
         if space.distance(position[None], ahead)[0] < 2.0:
             continue
         pitch, roll = np.radians(rng.normal(-8, 10)), np.radians(rng.normal(0, 4))
-        return Camera(pose_at(position, yaw, pitch, roll), lens.focal)
+        return RenderCamera(pose_at(position, yaw, pitch, roll), lens.focal)
     return None
 
 
 def _view_of(
     space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
-) -> Camera | None:
+) -> RenderCamera | None:
     """A camera that sees a point from a little above; None when none is found quickly."""
     for _ in range(12):
         reach, around = rng.uniform(0.6, 4.0), rng.uniform(0, 2 * np.pi)
@@ -174,5 +174,5 @@ def _view_of(
         pose = pose_at(
             position, yaw, float(np.clip(pitch, -1.2, 0.6)), np.radians(rng.normal(0, 4))
         )
-        return Camera(pose, lens.focal)
+        return RenderCamera(pose, lens.focal)
     return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
-from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.render.renderer import RenderCamera
 
 RATE = 60.0  # samples a second of a path
 # how a camera moves: metres a second, radians of slow turning, share
@@ -32,14 +32,14 @@ class CameraPath:
     pace: str = "walking"
     jitter: float = 0.0
 
-    def at(self, seconds: float) -> Camera:
+    def at(self, seconds: float) -> RenderCamera:
         """The camera at a time; before the start and after the end it stands still."""
         x = float(np.clip(seconds * RATE, 0, len(self.positions) - 1))
         i = min(int(x), len(self.positions) - 2)
         t = x - i
         position = (1 - t) * self.positions[i] + t * self.positions[i + 1]
         yaw, pitch, roll = (1 - t) * self.angles[i] + t * self.angles[i + 1]
-        return Camera(pose_at(position, yaw, pitch, roll), self.lens.focal)
+        return RenderCamera(pose_at(position, yaw, pitch, roll), self.lens.focal)
 
     def speed(self, seconds: float) -> tuple[float, float]:
         """Metres a second and degrees a second about a time."""

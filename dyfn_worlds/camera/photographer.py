@@ -12,10 +12,10 @@ from dyfn_worlds.camera.cameras import FreeSpace, Lens, random_view
 from dyfn_worlds.camera.paths import CameraPath, random_path
 from dyfn_worlds.camera.staging import LightScript, stage, stand
 from dyfn_worlds.render.occlusion import shade_corners
-from dyfn_worlds.render.renderer import Camera, Look, Picture, Renderer
+from dyfn_worlds.render.renderer import Picture, RenderCamera, Renderer, Shading
 from dyfn_worlds.scene.actors import STILL, Moment, Placement
 from dyfn_worlds.scene.scene import Scene
-from dyfn_worlds.shards import View
+from dyfn_worlds.shards import RenderedView
 
 PROBE_SHRINK = 4
 MAX_SUBFRAMES = 8
@@ -68,7 +68,7 @@ class Photographer:
         self.style = Style.sample(rng)
         renderer.load(scene)
 
-    def exposure(self, camera: Camera, moment: Moment = STILL) -> float | None:
+    def exposure(self, camera: RenderCamera, moment: Moment = STILL) -> float | None:
         """What brings the mean to this shoot's brightness; None for a view not worth keeping."""
         picture = self.renderer.draw(camera, self._look(1.0), moment, PROBE_SHRINK)
         image, depth = picture.image, picture.depth
@@ -84,9 +84,9 @@ class Photographer:
             return None
         return float(np.clip((self.style.brightness / mean) ** 2, *GAINS))
 
-    def frames(self, count: int) -> list[View]:
+    def frames(self, count: int) -> list[RenderedView]:
         """`count` independent views; fewer when the scene has not enough worth keeping."""
-        views: list[View] = []
+        views: list[RenderedView] = []
         for _ in range(count * 6):
             if len(views) == count:
                 break
@@ -101,7 +101,7 @@ class Photographer:
             views.append(self._shoot(shaken.at, partial(_always, moment), 0.5, exposure, "view"))
         return views
 
-    def clip(self, count: int, seconds: float) -> list[View]:
+    def clip(self, count: int, seconds: float) -> list[RenderedView]:
         """`count` consecutive views of one path, exposure following with a lag.
 
         Raises ValueError when no path is found on which most views are worth keeping.
@@ -118,7 +118,7 @@ class Photographer:
 
     def _film(
         self, path: CameraPath, times: np.ndarray, seconds: float, exposure: float
-    ) -> list[View]:
+    ) -> list[RenderedView]:
         actors = self.scene.actors
         ways = stage(self.space, self.rng, actors, path, seconds) if actors else []
         lamps = len(self.scene.lights)
@@ -127,7 +127,7 @@ class Photographer:
         def moment(t: float) -> Moment:
             return Moment(tuple(w.at(t) for w in ways), *script.at(t, lamps))
 
-        views: list[View] = []
+        views: list[RenderedView] = []
         keep = self.style.lag ** (seconds / len(times))
         exposure *= 2 ** float(self.rng.normal(0, 0.4))
         for t in times:
@@ -143,17 +143,17 @@ class Photographer:
             exposure = float(np.clip(exposure, *GAINS))
         return views
 
-    def _look(self, exposure: float) -> Look:
-        return Look(exposure, self.style.gloss, self.style.contrast)
+    def _look(self, exposure: float) -> Shading:
+        return Shading(exposure, self.style.gloss, self.style.contrast)
 
     def _shoot(
         self,
-        camera: Callable[[float], Camera],
+        camera: Callable[[float], RenderCamera],
         moment: Callable[[float], Moment],
         t: float,
         exposure: float,
         lighting: str,
-    ) -> View:
+    ) -> RenderedView:
         """One view at time t, its light integrated over the shutter time; depth is that of t."""
         now, look = moment(t), self._look(exposure)
         sharp = self.renderer.draw(camera(t), look, now)
@@ -177,9 +177,9 @@ class Photographer:
             "ambient": round(now.ambient, 4),
             "moving": [self._placed(p) for p in now.placements],
         }
-        return View(image, sharp.depth, camera(t), sharp.moving, record)
+        return RenderedView(image, sharp.depth, camera(t), sharp.moving, record)
 
-    def _nudged(self, camera: Camera, pixels: tuple[float, float]) -> Camera:
+    def _nudged(self, camera: RenderCamera, pixels: tuple[float, float]) -> RenderCamera:
         height, width = self.renderer.size
         (x, y), (cx, cy) = pixels, camera.centre
         return replace(camera, centre=(cx + x / width, cy + y / height))
@@ -193,7 +193,7 @@ class Photographer:
         }
 
     def _blur(
-        self, camera: Callable[[float], Camera], picture: Picture, now: Moment, t: float
+        self, camera: Callable[[float], RenderCamera], picture: Picture, now: Moment, t: float
     ) -> float:
         """Pixels that the picture smears within the shutter time, at its nearer surfaces."""
         if not self.style.shutter:
@@ -209,7 +209,7 @@ class Photographer:
             shift = max(shift, 1.2 * self.style.shutter / max(nearest, 0.3))
         return (angle + shift) * a.focal[0] * self.renderer.size[1]
 
-    def _shaken(self, camera: Camera) -> CameraPath:
+    def _shaken(self, camera: RenderCamera) -> CameraPath:
         """A second of movement through a single view, so that it can be blurred."""
         position = camera.pose[:3, 3]
         forward, down = camera.pose[:3, 2], camera.pose[:3, 1]
@@ -222,7 +222,7 @@ class Photographer:
         angles = np.array([yaw, pitch, roll]) + t * turn
         return CameraPath(position + t * drift, angles, Lens(camera.focal), "view")
 
-    def _extras(self, camera: Camera) -> tuple[Placement, ...]:
+    def _extras(self, camera: RenderCamera) -> tuple[Placement, ...]:
         if not self.scene.actors or self.rng.random() < 0.55:
             return ()
         count = int(self.rng.integers(1, 4))

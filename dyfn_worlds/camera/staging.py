@@ -8,7 +8,7 @@ import numpy as np
 
 from dyfn_worlds.camera.cameras import FAR, FreeSpace
 from dyfn_worlds.camera.paths import CameraPath
-from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.render.renderer import RenderCamera
 from dyfn_worlds.scene.actors import Actor, Placement
 
 LIGHTING = {"steady": 0.5, "drift": 0.2, "switch": 0.18, "dip": 0.12}
@@ -79,7 +79,11 @@ def stage(
 
 
 def stand(
-    space: FreeSpace, rng: np.random.Generator, actors: list[Actor], camera: Camera, count: int
+    space: FreeSpace,
+    rng: np.random.Generator,
+    actors: list[Actor],
+    camera: RenderCamera,
+    count: int,
 ) -> tuple[Placement, ...]:
     """Up to `count` actors in front of a single view, somewhere in their loops."""
     placed: list[Placement] = []
@@ -98,7 +102,7 @@ def stand(
 
 
 def _way(
-    space: FreeSpace, rng: np.random.Generator, index: int, actor: Actor, camera: Camera
+    space: FreeSpace, rng: np.random.Generator, index: int, actor: Actor, camera: RenderCamera
 ) -> Way | None:
     """A straight way over free floor that starts where the camera looks; None without room."""
     ahead = camera.pose[:3, 2] + camera.pose[:3, 0] * rng.normal(0, 0.3)

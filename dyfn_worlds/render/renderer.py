@@ -53,7 +53,7 @@ VERTEX_NAMES = (
 
 
 @dataclass(frozen=True)
-class Camera:
+class RenderCamera:
     """A pinhole camera. focal and centre are normalised by the image width and height.
 
     pose: 4 x 4 camera-to-world; camera axes are optical (x right, y down, z forward).
@@ -65,7 +65,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Look:
+class Shading:
     """How radiance becomes a picture. gloss: strength of highlights and reflections; contrast: 0
     (soft) to 1."""
 
@@ -177,7 +177,11 @@ class Renderer:
         ]  # fmt: skip
 
     def draw(
-        self, camera: Camera, look: Look = Look(), moment: Moment = STILL, shrink: int = 1
+        self,
+        camera: RenderCamera,
+        look: Shading = Shading(),
+        moment: Moment = STILL,
+        shrink: int = 1,
     ) -> Picture:
         """One picture of the scene at a moment.
 
@@ -212,7 +216,7 @@ class Renderer:
         for placement in moment.placements:
             self._actors[placement.actor].drawn[kind].render()
 
-    def _set_camera(self, camera: Camera, look: Look) -> None:
+    def _set_camera(self, camera: RenderCamera, look: Shading) -> None:
         view, projection = _view_matrix(camera.pose), _projection_matrix(camera)
         for program in (self.program, self.depth_program):
             program["view"].write(_column_major(view))
@@ -238,7 +242,7 @@ class Renderer:
         shadows = [self._actors[p.actor].drawn[2] for p in moment.placements]
         self._draw_shadows(self._actor_target, ACTOR_SHADOW_SIZE, shadows)
 
-    def _over_sky(self, rgba: np.ndarray, camera: Camera) -> np.ndarray:
+    def _over_sky(self, rgba: np.ndarray, camera: RenderCamera) -> np.ndarray:
         image = rgba[..., :3].copy()
         empty = rgba[..., 3] == 0
         if empty.any():
@@ -279,7 +283,7 @@ class Renderer:
         for face, axes in enumerate(CUBE_FACES):
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = np.array(axes, float).T, probe
-            self._set_camera(Camera(pose, (0.5, 0.5)), Look(gloss=0.0))
+            self._set_camera(RenderCamera(pose, (0.5, 0.5)), Shading(gloss=0.0))
             target.use()
             target.clear(0.0, 0.0, 0.0, 0.0, depth=1.0)
             self._render(0, STILL)
@@ -352,7 +356,7 @@ def _view_matrix(pose: np.ndarray) -> np.ndarray:
     return view
 
 
-def _projection_matrix(camera: Camera, far: float = 2000.0, near: float = NEAR) -> np.ndarray:
+def _projection_matrix(camera: RenderCamera, far: float = 2000.0, near: float = NEAR) -> np.ndarray:
     """Optical axes to clip space; v grows with GL's y, so that row 0 is the image's top."""
     (fx, fy), (cx, cy) = camera.focal, camera.centre
     return np.array(
@@ -376,4 +380,4 @@ def _light_matrix(light: Light) -> np.ndarray:
     near = NEAR
     if light.window is not None:
         near += float(((light.window.corners() - light.position) @ forward).max())
-    return _projection_matrix(Camera(pose, (focal, focal)), 40.0, near) @ _view_matrix(pose)
+    return _projection_matrix(RenderCamera(pose, (focal, focal)), 40.0, near) @ _view_matrix(pose)

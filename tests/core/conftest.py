@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
 
 FOV_X = 70.0
@@ -28,7 +28,7 @@ class PinholeModel(GeometryModel):
         self.unit = torch.nn.Parameter(torch.ones(1))
         if stabilized:
             torch.manual_seed(0)
-            self.stabilizer = build_stabilizer(3, StabilizerConfig(hidden=4, form="residual"))
+            self.stabilizer = build_dyfn(3, DyFNConfig(hidden=4, form="residual"))
             for head in (self.stabilizer.gamma_head, self.stabilizer.beta_head):
                 torch.nn.init.normal_(head.weight, std=0.05)
 
@@ -90,7 +90,7 @@ def small_moge() -> MoGeModel:
         num_tokens_range=(6, 12),
     )
     model = MoGeModel(config)
-    model.stabilizer = build_stabilizer(32, StabilizerConfig(hidden=8))
+    model.stabilizer = build_dyfn(32, DyFNConfig(hidden=8))
     torch.nn.init.normal_(model.stabilizer.gamma_head.weight, std=0.5)
     torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)
     torch.nn.init.ones_(model.head.output_block[1][-1].bias)  # a mask that is mostly True

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from dyfn_worlds.render.renderer import Camera
+from dyfn_worlds.render.renderer import RenderCamera
 
 SIZE = (48, 64)
 
 
-def rays(camera: Camera) -> np.ndarray:
+def rays(camera: RenderCamera) -> np.ndarray:
     """H x W x 3 camera rays with z = 1 through the pixel centres."""
     v, u = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
     x = (u / SIZE[1] - camera.centre[0]) / camera.focal[0]

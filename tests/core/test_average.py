@@ -9,7 +9,7 @@ import torch
 
 from dyfn_core.cli.train import main
 from dyfn_core.models.checkpoints import load_model, save_model
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniConfig, MiniModel
 
 SMALL = MiniConfig(latent_channels=16, stage_channels=(16, 8), context_layers=0)
@@ -18,9 +18,7 @@ SMALL = MiniConfig(latent_channels=16, stage_channels=(16, 8), context_layers=0)
 def saved(folder: Path, name: str, seed: int, config: MiniConfig = SMALL) -> Path:
     torch.manual_seed(seed)
     model = MiniModel(config)
-    model.stabilizer = build_stabilizer(
-        model.latent_channels, StabilizerConfig(hidden=4, form="residual")
-    )
+    model.stabilizer = build_dyfn(model.latent_channels, DyFNConfig(hidden=4, form="residual"))
     path = folder / f"{name}.safetensors"
     save_model(model, path)
     return path

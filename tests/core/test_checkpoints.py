@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 
 import dyfn_core
 from dyfn_core.models import CheckpointError, checkpoints, load_model, save_model
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
 
@@ -26,7 +26,7 @@ def official(small_moge: MoGeModel) -> Official:
     """small_moge as a released file: official names, fp16 weights, stabilizer of hidden 256."""
     torch.manual_seed(0)
     model = MoGeModel(small_moge.architecture)
-    model.stabilizer = build_stabilizer(32, StabilizerConfig())
+    model.stabilizer = build_dyfn(32, DyFNConfig())
     config = {key: value for key, value in model.config.items() if key != "type"}
     return {
         "model_config": {**config, "stabilizer_type": "ConvGRU"},
@@ -45,7 +45,7 @@ def written(path: Path, content: object) -> Path:
 def test_official_file_loads_into_float32(official: Official, tmp_path: Path) -> None:
     model = load_model(written(tmp_path / "DyFN.pt", official))
     assert not model.training
-    assert model.stabilizer.config == StabilizerConfig(kind="convgru", hidden=256)
+    assert model.stabilizer.config == DyFNConfig(kind="convgru", hidden=256)
     state = model.state_dict()
     assert len(state) == len(official["model"])
     for key, value in official["model"].items():
@@ -59,7 +59,7 @@ def test_official_gru_and_plain_files_load(official: Official, tmp_path: Path) -
     config = {k: v for k, v in official["model_config"].items() if k != "stabilizer_type"}
     base = load_model(written(tmp_path / "base.pt", {"model_config": config, "model": plain}))
     assert base.stabilizer is None
-    gru = build_stabilizer(32, StabilizerConfig(kind="gru"))
+    gru = build_dyfn(32, DyFNConfig(kind="gru"))
     weights = {**plain, **{f"head.stabilizer.{k}": v for k, v in gru.state_dict().items()}}
     content = {"model_config": {**config, "stabilizer_type": "GRU"}, "model": weights}
     model = load_model(written(tmp_path / "gru.pt", content))
@@ -106,8 +106,8 @@ def test_our_format_round_trip(small_moge: MoGeModel, tmp_path: Path, kind: str 
     torch.manual_seed(0)
     model = MoGeModel(replace(small_moge.architecture, mask_threshold=0.4)).eval()
     if kind:
-        settings = StabilizerConfig(kind=kind, hidden=6, pool=2, form="residual")
-        model.stabilizer = build_stabilizer(32, settings)
+        settings = DyFNConfig(kind=kind, hidden=6, pool=2, form="residual")
+        model.stabilizer = build_dyfn(32, settings)
     path = tmp_path / "model.safetensors"
     save_model(model, path, notes={"steps": "12"})
     loaded = load_model(path)
@@ -138,8 +138,8 @@ def test_half_precision_file_is_half_the_size_and_loads_as_float32(
 def test_mini_model_round_trip(tmp_path: Path) -> None:
     torch.manual_seed(0)
     model = MiniModel().eval()
-    model.stabilizer = build_stabilizer(
-        model.latent_channels, StabilizerConfig(hidden=8, pool=4, form="residual")
+    model.stabilizer = build_dyfn(
+        model.latent_channels, DyFNConfig(hidden=8, pool=4, form="residual")
     )
     save_model(model, tmp_path / "mini.safetensors")
     loaded = load_model(tmp_path / "mini.safetensors")

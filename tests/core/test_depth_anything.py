@@ -19,7 +19,7 @@ from dyfn_core.models.checkpoints import (
     save_model,
 )
 from dyfn_core.models.depth_anything import DepthAnythingConfig, DepthAnythingModel
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.stream.depth_stream import DepthStream, push_together
 
@@ -132,7 +132,7 @@ def test_our_format_keeps_model_and_stabilizer(
 ) -> None:
     made = DepthAnythingModel(untrained.settings).eval()
     made.load_state_dict(untrained.state_dict())
-    made.stabilizer = build_stabilizer(made.latent_channels, StabilizerConfig(hidden=8, pool=4))
+    made.stabilizer = build_dyfn(made.latent_channels, DyFNConfig(hidden=8, pool=4))
     save_model(made, tmp_path / "model.safetensors")
     loaded = build_model(read_checkpoint(tmp_path / "model.safetensors"), "file").eval()
     image = np.random.default_rng(0).integers(0, 255, (56, 70, 3), np.uint8)

@@ -9,8 +9,13 @@ from torch import Tensor, nn
 
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.deterministic import Conv2d, GroupNorm, Linear, resize
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.deterministic import (
+    DeterministicConv2d,
+    DeterministicGroupNorm,
+    DeterministicLinear,
+    resize,
+)
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.stream.depth_stream import DepthStream, push_together
 
@@ -32,7 +37,7 @@ def mini() -> GeometryModel:
 def moge() -> MoGeModel:
     torch.manual_seed(0)
     model = MoGeModel.from_config(MOGE)
-    model.stabilizer = build_stabilizer(model.latent_channels, StabilizerConfig(hidden=16))
+    model.stabilizer = build_dyfn(model.latent_channels, DyFNConfig(hidden=16))
     return model.eval()
 
 
@@ -96,31 +101,34 @@ def test_convolutions_and_their_gradients_are_those_of_torch(
     settings: dict, shape: tuple[int, ...]
 ) -> None:
     torch.manual_seed(0)
-    ours, theirs = Conv2d(8, 12, **settings), nn.Conv2d(8, 12, **settings)
+    ours, theirs = DeterministicConv2d(8, 12, **settings), nn.Conv2d(8, 12, **settings)
     theirs.load_state_dict(ours.state_dict())
     _compare(ours, theirs, torch.randn(shape))
 
 
 def test_a_convolution_of_one_cell_is_that_of_torch() -> None:
-    ours, theirs = Conv2d(8, 12, 1), nn.Conv2d(8, 12, 1)
+    ours, theirs = DeterministicConv2d(8, 12, 1), nn.Conv2d(8, 12, 1)
     theirs.load_state_dict(ours.state_dict())
     _compare(ours, theirs, torch.randn(3, 8, 1, 1))
 
 
 @pytest.mark.parametrize("shape", [(2, 7, 8), (3, 8), (1, 1, 8)])
 def test_linear_layers_and_norms_are_those_of_torch(shape: tuple[int, ...]) -> None:
-    ours, theirs = Linear(8, 12), nn.Linear(8, 12)
+    ours, theirs = DeterministicLinear(8, 12), nn.Linear(8, 12)
     theirs.load_state_dict(ours.state_dict())
     _compare(ours, theirs, torch.randn(shape))
     pixels = torch.randn(2, 8, 6, 5).contiguous(memory_format=torch.channels_last)
-    _compare(GroupNorm(4, 8), nn.GroupNorm(4, 8), pixels)
+    _compare(DeterministicGroupNorm(4, 8), nn.GroupNorm(4, 8), pixels)
 
 
 def test_half_precision_is_left_to_torch() -> None:
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert Conv2d(8, 4, 1)(torch.randn(1, 8, 3, 3)).dtype == torch.bfloat16
-        assert Linear(8, 4)(torch.randn(1, 3, 8)).dtype == torch.bfloat16
-    assert Conv2d(8, 4, 1).double()(torch.randn(1, 8, 3, 3).double()).dtype == torch.float64
+        assert DeterministicConv2d(8, 4, 1)(torch.randn(1, 8, 3, 3)).dtype == torch.bfloat16
+        assert DeterministicLinear(8, 4)(torch.randn(1, 3, 8)).dtype == torch.bfloat16
+    assert (
+        DeterministicConv2d(8, 4, 1).double()(torch.randn(1, 8, 3, 3).double()).dtype
+        == torch.float64
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import load_model, save_model
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.efficientnet import BATCH_NORM_EPS, EfficientNetLite0, imagenet_weights
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 
@@ -146,7 +146,7 @@ def test_untrained_model_sees_a_plane_through_a_pinhole(model: MiniModel) -> Non
 def test_checkpoint_brings_the_same_model_back(model: MiniModel, tmp_path: Path) -> None:
     torch.manual_seed(1)
     saved = MiniModel(SMALL).eval()
-    saved.stabilizer = build_stabilizer(16, StabilizerConfig(hidden=4, pool=2, form="residual"))
+    saved.stabilizer = build_dyfn(16, DyFNConfig(hidden=4, pool=2, form="residual"))
     save_model(saved, tmp_path / "mini.safetensors")
     loaded = load_model(tmp_path / "mini.safetensors")
     image = torch.rand(1, 3, 64, 96)

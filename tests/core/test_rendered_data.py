@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from made_frames import INTRINSICS, SIZE, made_frame, write_data_set, write_shard
 
-from dyfn_core.data.augment import apply_look, apply_view, draw_look, draw_view
+from dyfn_core.data.augment import apply_appearance, apply_crop, draw_appearance, draw_crop
 from dyfn_core.data.clips import ClipSource, SizeStage, draw_batch, find_sequences
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import decode_depth, encode_depth, list_shards, read_shard
@@ -82,9 +82,9 @@ def test_points_stay_the_same_under_a_new_view(seed: int) -> None:
     image, depth = made_frame(rng)
     height, width = SIZE
     tag = (np.arange(height)[:, None] * width + np.arange(width)).astype(np.float32)
-    view = draw_view(rng, width / height, rng.uniform(0.7, 1.6))
+    view = draw_crop(rng, width / height, rng.uniform(0.7, 1.6))
     args = (np.array(INTRINSICS), view, (64, 64), (32, 32))
-    _, tags, intrinsics = apply_view(image, tag, *args)
+    _, tags, intrinsics = apply_crop(image, tag, *args)
     row, col = tags.astype(int) // width, tags.astype(int) % width
     fx, fy, cx, cy = INTRINSICS
     old = np.stack([((col + 0.5) / width - cx) / fx, ((row + 0.5) / height - cy) / fy])
@@ -100,19 +100,23 @@ def test_points_stay_the_same_under_a_new_view(seed: int) -> None:
 
 def test_look_of_strength_zero_changes_nothing_and_of_one_does() -> None:
     image, _ = made_frame(np.random.default_rng(0))
-    same = apply_look(image, draw_look(np.random.default_rng(1), 0.0))
+    same = apply_appearance(image, draw_appearance(np.random.default_rng(1), 0.0))
     assert np.abs(same.astype(int) - image).max() <= 1
-    changed = apply_look(image, draw_look(np.random.default_rng(1), 1.0))
+    changed = apply_appearance(image, draw_appearance(np.random.default_rng(1), 1.0))
     assert np.abs(changed.astype(int) - image).mean() > 3
 
 
 def test_look_is_a_value_and_only_noise_differs_between_frames() -> None:
     image, _ = made_frame(np.random.default_rng(0))
-    look = replace(draw_look(np.random.default_rng(3)), noise=(0.05, 0.02), jpeg=None)
-    np.testing.assert_array_equal(apply_look(image, look, 1), apply_look(image, look, 1))
-    assert (apply_look(image, look, 1) != apply_look(image, look, 2)).any()
+    look = replace(draw_appearance(np.random.default_rng(3)), noise=(0.05, 0.02), jpeg=None)
+    np.testing.assert_array_equal(
+        apply_appearance(image, look, 1), apply_appearance(image, look, 1)
+    )
+    assert (apply_appearance(image, look, 1) != apply_appearance(image, look, 2)).any()
     silent = replace(look, noise=(0.0, 0.0))
-    np.testing.assert_array_equal(apply_look(image, silent, 1), apply_look(image, silent, 2))
+    np.testing.assert_array_equal(
+        apply_appearance(image, silent, 1), apply_appearance(image, silent, 2)
+    )
 
 
 def test_batch_depends_on_its_number_alone(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.tasks.dyfn_linearized import ScaleTask
 from dyfn_core.training.tasks.gru_input_cache import (
     decoded_z,
+    gru_inputs,
     mean_log,
     scale_slope,
-    summarise_clips,
 )
 from dyfn_core.training.tasks.latent_cache import encode_clips
 
@@ -47,7 +47,7 @@ def task(place: Path, cache: Path, *overrides: str) -> ScaleTask:
 def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Path) -> None:
     made = task(place, tmp_path)
     batch = draw_batch(made.source, find_sequences(made.source, "train"), 0)
-    parts = summarise_clips(made.model, batch)
+    parts = gru_inputs(made.model, batch)
     clips = encode_clips(made.model, batch)
     latent = Latent(clips.latent[0, 2:3].float(), (16, 32), clips.network_size)
     affine = made.model.decode(latent)
@@ -64,7 +64,7 @@ def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Pat
 def test_samples_pair_the_bases_depth_with_the_true_one(place: Path, tmp_path: Path) -> None:
     made = task(place, tmp_path)
     batch = draw_batch(made.source, find_sequences(made.source, "train"), 0)
-    parts = summarise_clips(made.model, batch)
+    parts = gru_inputs(made.model, batch)
     clips = encode_clips(made.model, batch)
     latent = Latent(clips.latent[0].float(), (16, 32), clips.network_size)
     z = decoded_z(made.model, latent).detach()

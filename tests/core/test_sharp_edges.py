@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dyfn_core.losses.gradient import gradient_loss
 from dyfn_core.losses.target import Target, target_from_depth
-from dyfn_core.models.mini import ResidualBlock
+from dyfn_core.models.mini import MiniResidualBlock
 
 
 def step_scene(near: float = 1.0, far: float = 3.0) -> Target:
@@ -46,7 +46,7 @@ def test_gradient_term_of_nothing_valid_is_zero_with_zero_gradient() -> None:
     assert points.grad is not None and not points.grad.any()
 
 
-def _alive(block: ResidualBlock, x: Tensor) -> float:
+def _alive(block: MiniResidualBlock, x: Tensor) -> float:
     """Share of the inner activations' inputs that are positive."""
     seen: list[Tensor] = []
     handle = block.norm_second.register_forward_hook(lambda _m, _i, out: seen.append(out))
@@ -58,7 +58,7 @@ def _alive(block: ResidualBlock, x: Tensor) -> float:
 def test_residual_block_sees_detail_beside_channels_at_other_levels() -> None:
     """One channel a hundred deviations away must not drown the detail of the others."""
     torch.manual_seed(0)
-    block = ResidualBlock(64)
+    block = MiniResidualBlock(64)
     detail = torch.randn(2, 64, 12, 16)
     level = torch.zeros(1, 64, 1, 1)
     level[:, 0], level[:, 33] = 100.0, -100.0
@@ -70,7 +70,7 @@ def test_residual_block_sees_detail_beside_channels_at_other_levels() -> None:
 
 def test_every_weight_of_a_residual_block_has_a_gradient() -> None:
     torch.manual_seed(0)
-    block = ResidualBlock(16)
+    block = MiniResidualBlock(16)
     x = torch.randn(2, 16, 8, 8) + 50 * torch.randn(1, 16, 1, 1)
     (block(x) * torch.randn(2, 16, 8, 8)).sum().backward()
     for name, parameter in block.named_parameters():

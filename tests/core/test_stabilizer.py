@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
 
 KINDS = ["convgru", "gru"]
@@ -20,7 +20,7 @@ def latent(seed: int, batch: int = 1, size: tuple[int, int] = (6, 9)) -> torch.T
 
 def make(kind: str, form: str = "paper", pool: int = 1, trained: bool = True) -> torch.nn.Module:
     torch.manual_seed(1)
-    module = build_stabilizer(5, StabilizerConfig(kind=kind, hidden=7, pool=pool, form=form))
+    module = build_dyfn(5, DyFNConfig(kind=kind, hidden=7, pool=pool, form=form))
     if trained:
         for name, parameter in module.named_parameters():
             if "head" in name:
@@ -30,8 +30,8 @@ def make(kind: str, form: str = "paper", pool: int = 1, trained: bool = True) ->
 
 def memory_only(kind: str) -> torch.nn.Module:
     torch.manual_seed(1)
-    config = StabilizerConfig(kind=kind, hidden=7, form="residual", memory_only=True)
-    module = build_stabilizer(5, config)
+    config = DyFNConfig(kind=kind, hidden=7, form="residual", memory_only=True)
+    module = build_dyfn(5, config)
     for parameter in module.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     return module.eval()
@@ -74,7 +74,7 @@ def stacked(one: StreamState, other: StreamState) -> StreamState:
 
 def test_memory_only_belongs_to_the_residual_form() -> None:
     with pytest.raises(ValueError, match="memory_only needs the form 'residual', got form 'paper'"):
-        StabilizerConfig(memory_only=True)
+        DyFNConfig(memory_only=True)
 
 
 def test_paper_form_starts_with_the_released_statistics() -> None:
@@ -203,11 +203,11 @@ def test_latent_of_one_cell_is_refused() -> None:
 )
 def test_bad_config_is_refused(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
-        StabilizerConfig(**options)
+        DyFNConfig(**options)
 
 
 def test_released_size() -> None:
-    module = build_stabilizer(512, StabilizerConfig())
+    module = build_dyfn(512, DyFNConfig())
     assert sum(parameter.numel() for parameter in module.parameters()) == 5_572_352
 
 

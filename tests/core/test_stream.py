@@ -13,7 +13,7 @@ from conftest import FOV_X, PinholeModel, picture
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction, StreamState
-from dyfn_core.stream.depth_stream import DepthStream, RobustMean, Track, push_together
+from dyfn_core.stream.depth_stream import DepthStream, MeanState, RobustMean, push_together
 
 FOCAL = 32 / np.tan(np.radians(FOV_X / 2))
 CAMERA = np.array([[FOCAL, 0, 31.5], [0, FOCAL, 23.5], [0, 0, 1]])
@@ -195,7 +195,7 @@ def test_held_shift_never_puts_much_of_a_frame_behind_the_camera(pinhole: Pinhol
     far = image.copy()
     far[..., 0] = np.clip(image[..., 0].astype(int) + 90, 0, 255)
     stream.push(far)
-    stream.memory = replace(stream.memory, shift=Track(-1.0))
+    stream.memory = replace(stream.memory, shift=MeanState(-1.0))
     prediction = stream.push(image)
     assert prediction.mask.float().mean() > 0.9
     assert (prediction.depth[prediction.mask] > 0).all()

@@ -11,7 +11,7 @@ from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from dyfn_ros.messages.images import MessageError
-from dyfn_ros.messages.rectify import CalibrationRules, Calibrator, View, undistort_depth
+from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules, undistort_depth
 
 HEIGHT, WIDTH = 60, 80
 K = np.array([[70.0, 0, 41.0], [0, 72.0, 28.0], [0, 0, 1]])
@@ -47,12 +47,12 @@ def ramp(pixels: np.ndarray) -> np.ndarray:
     return np.stack([2 * u, 3 * v, np.full_like(u, 7)], axis=-1)
 
 
-def view(message: CameraInfo, **rules: Any) -> tuple[View, list[str]]:
+def view(message: CameraInfo, **rules: Any) -> tuple[PinholeImage, list[str]]:
     warnings: list[str] = []
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     image = ramp(np.stack([u, v], axis=-1)).astype(np.uint8)
-    calibrator = Calibrator(warnings.append)
-    return calibrator.view(image, "optical", message, CalibrationRules(**rules)), warnings
+    calibrator = Rectifier(warnings.append)
+    return calibrator.view(image, "optical", message, RectifyRules(**rules)), warnings
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -82,7 +82,7 @@ def test_depth_goes_the_way_of_its_image_also_at_another_size() -> None:
     assert known.mean() > 0.9
     assert np.abs(half - got.image[..., 0] / 2)[known].max() < 1.0
     plain = np.ones((3, 4), np.float32)
-    assert undistort_depth(plain, View(got.image)) is plain
+    assert undistort_depth(plain, PinholeImage(got.image)) is plain
 
 
 def test_a_pinhole_passes_through_untouched() -> None:

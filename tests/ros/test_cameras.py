@@ -352,9 +352,9 @@ def test_a_distorted_lens_is_undone_or_refused(rig: Rig) -> None:
     rig.reset()
     image = frames(1)[0]
     got = as_depth(rig.play("front", [image])[0])
-    from dyfn_ros.messages.rectify import CalibrationRules, Calibrator
+    from dyfn_ros.messages.rectify import Rectifier, RectifyRules
 
-    view = Calibrator(print).view(image, "optical", info, CalibrationRules())
+    view = Rectifier(print).view(image, "optical", info, RectifyRules())
     assert view.visible is not None
     expected = np.where(view.visible, alone([view.image], matrix)[0], np.nan)
     assert_close(got, expected)

@@ -11,7 +11,7 @@ import pytest
 from tiny_model import load_tiny
 
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.replay import batch as fleet
 from dyfn_ros.replay.batch import expand, is_many, plan, run_locally
 from dyfn_ros.replay.batch_summary import mean_of
@@ -28,7 +28,7 @@ def record(path: Path, seed: int = 0, frames: int = 2) -> Path:
     for index in range(frames):
         image = cv2.resize(rng.integers(0, 255, (5, 6, 3), np.uint8), (48, 36))
         depth = cv2.resize(rng.uniform(1, 4, (4, 5)), (48, 36))
-        made.append(RgbdFrame(image, depth, CAMERA, None, 50 + index / 15))
+        made.append(FrameToRecord(image, depth, CAMERA, None, 50 + index / 15))
     write_rgbd_recording(path, made)
     return path
 

@@ -20,14 +20,14 @@ from dyfn_ros.demo.node_process import NodeProcess
 from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.node.environment import prepare_environment
 from dyfn_ros.recordings.open import RecordedFrame, open_recording
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
 
 COUNT, SIZE = 12, (240, 320)
 CAMERA = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
 
 
-def walk() -> list[RgbdFrame]:
+def walk() -> list[FrameToRecord]:
     """A window that moves over a large picture of blobs and stripes, and grows darker."""
     rng = np.random.default_rng(5)
     large = cv2.resize(rng.integers(0, 255, (30, 44, 3), np.uint8), (700, 480))
@@ -36,7 +36,7 @@ def walk() -> list[RgbdFrame]:
     for index in range(COUNT):
         y, x = 6 * index, 17 * index
         image = (large[y : y + SIZE[0], x : x + SIZE[1]] * (1 - 0.04 * index)).astype(np.uint8)
-        found.append(RgbdFrame(image, None, CAMERA, None, 50 + index / 15))
+        found.append(FrameToRecord(image, None, CAMERA, None, 50 + index / 15))
     return found
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from made_recordings import MAKERS, make, shade
 
 from dyfn_ros.recordings.open import RecordingError, open_recording
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 
 COUNT = 5
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
@@ -60,7 +60,7 @@ def intact(kind: str) -> dict[str, bytes]:
         path = Path(folder) / kind
         if kind in RGBD:
             depth = np.full((24, 32), 2.0)
-            frames = [RgbdFrame(shade(i), depth, CAMERA, None, i / 10) for i in range(COUNT)]
+            frames = [FrameToRecord(shade(i), depth, CAMERA, None, i / 10) for i in range(COUNT)]
             write_rgbd_recording(path, frames)
         else:
             make(Path(folder), kind, COUNT)

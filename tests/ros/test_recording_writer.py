@@ -12,14 +12,14 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES, depth_to_millimetres, quaternion_from_matrix
 from dyfn_ros.recordings.writer import RecordingWriter
 
 CAMERA = np.array([[100.0, 0, 31.5], [0, 101.0, 23.5], [0, 0, 1]])
 
 
-def frames(count: int = 3) -> list[RgbdFrame]:
+def frames(count: int = 3) -> list[FrameToRecord]:
     rng = np.random.default_rng(0)
     made = []
     for index in range(count):
@@ -28,7 +28,7 @@ def frames(count: int = 3) -> list[RgbdFrame]:
         depth[0, :3] = [0, np.nan, np.inf]
         pose = np.eye(4)
         pose[:3, 3] = [index, 2, 3]
-        made.append(RgbdFrame(image, depth, CAMERA, pose, 12.5 + index / 10))
+        made.append(FrameToRecord(image, depth, CAMERA, pose, 12.5 + index / 10))
     return made
 
 

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import Writer as McapWriter
 
 from dyfn_ros.recordings.open import RecordedFrame, RecordingError, image_topics, open_recording
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.topics import Topics
 from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
@@ -38,9 +38,9 @@ def truth(index: int) -> np.ndarray:
     return depth
 
 
-def rgbd(count: int = 5) -> Iterator[RgbdFrame]:
+def rgbd(count: int = 5) -> Iterator[FrameToRecord]:
     for index in range(count):
-        yield RgbdFrame(picture(index), truth(index), CAMERA, np.eye(4), 100 + index / 10)
+        yield FrameToRecord(picture(index), truth(index), CAMERA, np.eye(4), 100 + index / 10)
 
 
 def read(path: Path, **options: object) -> list[RecordedFrame]:

@@ -22,7 +22,7 @@ from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_core.threads import THREADS
 from dyfn_ros.messages.clouds import cloud_points
 from dyfn_ros.messages.images import decode_depth
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
@@ -32,14 +32,14 @@ SIZE = (36, 48)
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
 
 
-def rgbd(count: int, truth: bool = True) -> list[RgbdFrame]:
+def rgbd(count: int, truth: bool = True) -> list[FrameToRecord]:
     rng = np.random.default_rng(3)
     made = []
     for index in range(count):
         image = cv2.resize(rng.integers(0, 255, (5, 6, 3), np.uint8), SIZE[::-1])
         depth = cv2.resize(rng.uniform(1, 4, (4, 5)), SIZE[::-1])
         depth[:3] = 0
-        made.append(RgbdFrame(image, depth if truth else None, CAMERA, None, 50 + index / 15))
+        made.append(FrameToRecord(image, depth if truth else None, CAMERA, None, 50 + index / 15))
     return made
 
 
@@ -208,7 +208,7 @@ def test_frames_can_be_limited_and_thinned(recording: Path, tmp_path: Path) -> N
 
 def test_truth_of_another_resolution_is_compared_at_its_pixels(tmp_path: Path) -> None:
     half = [
-        RgbdFrame(f.image, f.depth_m[1::2, 1::2], CAMERA, None, f.stamp)  # type: ignore[index]
+        FrameToRecord(f.image, f.depth_m[1::2, 1::2], CAMERA, None, f.stamp)  # type: ignore[index]
         for f in rgbd(3)
     ]
     write_rgbd_recording(tmp_path / "walk", half)
@@ -222,7 +222,7 @@ def test_truth_of_another_resolution_is_compared_at_its_pixels(tmp_path: Path) -
 def test_truth_of_another_field_of_view_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cut = [RgbdFrame(f.image, f.depth_m[:, :20], CAMERA, None, f.stamp) for f in rgbd(2)]  # type: ignore[index]
+    cut = [FrameToRecord(f.image, f.depth_m[:, :20], CAMERA, None, f.stamp) for f in rgbd(2)]  # type: ignore[index]
     write_rgbd_recording(tmp_path / "walk", cut)
     assert run(tmp_path / "walk", tmp_path / "out") == UNUSABLE
     assert "/camera/depth/image/compressed: ground truth of 20 x 36" in capsys.readouterr().err
@@ -337,7 +337,7 @@ def drifting(truth: np.ndarray, index: int) -> np.ndarray:
 
 def other_method(
     path: Path, says: Callable[[np.ndarray, int], np.ndarray] = drifting
-) -> list[RgbdFrame]:
+) -> list[FrameToRecord]:
     """A camera, its truth, and what another node says of it; that node missed the second."""
     frames = rgbd(4)
     with RecordingWriter(path) as writer:

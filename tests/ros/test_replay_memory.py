@@ -14,7 +14,7 @@ from tiny_model import load_tiny
 from dyfn_core.evaluation.report import worst_frames
 from dyfn_core.geometry import voxel_grid
 from dyfn_core.scoring import protocols
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame, write_rgbd_recording
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.run import ALL
 
@@ -42,7 +42,7 @@ def peak(folder: Path, count: int) -> int:
         place = index % ROUND
         depth = np.full(SIZE, WALL - 0.3 * place)
         image = np.roll(picture, place, axis=1)
-        frames.append(RgbdFrame(image, depth, CAMERA, camera_pose(place), 50 + index / 10))
+        frames.append(FrameToRecord(image, depth, CAMERA, camera_pose(place), 50 + index / 10))
     write_rgbd_recording(folder / f"walk{count}", frames)
     arguments = [str(folder / f"walk{count}"), "--out", str(folder / f"out{count}")]
     gc.collect()

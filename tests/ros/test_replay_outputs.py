@@ -20,7 +20,7 @@ from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_core.stream.session import Geometry
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.poses import ODOMETRY, PoseError, open_poses
-from dyfn_ros.recordings.rgbd_writer import RgbdFrame
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording as record
 from dyfn_ros.recordings.typestore import TYPES, header
 from dyfn_ros.recordings.writer import RecordingWriter
@@ -43,14 +43,14 @@ def camera_pose(index: int) -> np.ndarray:
     return made
 
 
-def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[RgbdFrame]:
+def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[FrameToRecord]:
     """Frames of a wall whose colour is green; true depth is the distance to it."""
     image = np.full((*SIZE, 3), (10, 200, 30), np.uint8)
     found = []
     for index in range(count):
         depth = np.full(SIZE, WALL - 0.3 * index)
         where = camera_pose(index) if poses else None
-        found.append(RgbdFrame(image, depth if truth else None, CAMERA, where, 50 + index / 10))
+        found.append(FrameToRecord(image, depth if truth else None, CAMERA, where, 50 + index / 10))
     return found
 
 
@@ -66,7 +66,7 @@ def perfect_up_to(scale: float, depth: np.ndarray) -> Geometry:
 def written(tmp_path: Path) -> Callable[..., list[str]]:
     """Plays a recording through ReplayOutputs with a perfect model; gives the warnings."""
 
-    def write(frames: list[RgbdFrame], aligned: bool = True, **options: Any) -> list[str]:
+    def write(frames: list[FrameToRecord], aligned: bool = True, **options: Any) -> list[str]:
         from dyfn_core.scoring.protocols import FrameScore
 
         record(tmp_path / "walk", frames, jpeg_quality=None, overwrite=True)
@@ -140,7 +140,7 @@ def test_the_video_plays_at_the_pace_of_the_stamps(
     tmp_path: Path, written: Callable[..., list[str]]
 ) -> None:
     frames = facing_a_wall(5)
-    frames[4] = RgbdFrame(frames[4].image, frames[4].depth_m, CAMERA, None, 75.0)
+    frames[4] = FrameToRecord(frames[4].image, frames[4].depth_m, CAMERA, None, 75.0)
     written(frames, write=("video",))
     with av.open(str(tmp_path / "out" / "video.mp4")) as video:
         assert video.streams.video[0].codec_context.name == "h264"
@@ -229,7 +229,9 @@ def noisy_walk(folder: Path) -> list[str]:
     """A recording that no codec makes small, and the arguments to replay it."""
     rng = np.random.default_rng(0)
     noise = [
-        RgbdFrame(rng.integers(0, 255, (*SIZE, 3), np.uint8), f.depth_m, CAMERA, f.pose, f.stamp)
+        FrameToRecord(
+            rng.integers(0, 255, (*SIZE, 3), np.uint8), f.depth_m, CAMERA, f.pose, f.stamp
+        )
         for f in facing_a_wall(12)
     ]
     record(folder / "walk", noise)

@@ -11,7 +11,7 @@ import pytest
 from tiny_model import load_tiny
 
 from dyfn_core.stream.scene_cut_hook import SceneCutHook
-from dyfn_core.stream.session import CameraStream, StreamFrame, stream_maker
+from dyfn_core.stream.session import StreamFrame, StreamSession, stream_maker
 from dyfn_core.stream.state_hook import StateError, StateHook, path_for
 from dyfn_ros.node.metric_scale import MetricHook
 from dyfn_ros.node.parameters.table import Settings
@@ -36,7 +36,7 @@ class Robot:
         model = load_tiny()
         self.ports, self.warnings = Ports(), []
         self.hooks: list[Any] = []
-        self.stream = CameraStream(stream_maker(model), hooks=self.hooks)
+        self.stream = StreamSession(stream_maker(model), hooks=self.hooks)
         self.cut = SceneCutHook(lambda: self.settings.scene_cut_threshold)
         self.metric = MetricHook(lambda: self.settings, self.ports, self.warnings.append)  # type: ignore[arg-type]
         self.state = StateHook(self.stream, self.metric, self.cut, model)

@@ -21,11 +21,11 @@ from dyfn_core.stream.session import (
     NEW_FRAME_ID,
     NEW_SETTINGS,
     NEW_SIZE,
-    CameraStream,
     Geometry,
     StreamFrame,
     StreamHook,
     StreamKey,
+    StreamSession,
     TimeRules,
 )
 from dyfn_ros.node.log_throttle import Throttle
@@ -207,21 +207,21 @@ class FakeStream:
         return Prediction(depth[..., None].repeat(1, 1, 3), depth, depth > 0, intrinsics)
 
 
-def fake_camera(**options: Any) -> tuple[CameraStream, list[StreamKey]]:
+def fake_camera(**options: Any) -> tuple[StreamSession, list[StreamKey]]:
     made: list[StreamKey] = []
 
     def make(key: StreamKey) -> Any:
         made.append(key)
         return FakeStream(key)
 
-    return CameraStream(make, **options), made
+    return StreamSession(make, **options), made
 
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
 MATRIX = np.array([[3.0, 0, 2.5], [0, 4, 1.5], [0, 0, 1]])
 
 
-def seen(camera: CameraStream, frames: list[dict[str, Any]]) -> list[tuple[int, str | None]]:
+def seen(camera: StreamSession, frames: list[dict[str, Any]]) -> list[tuple[int, str | None]]:
     """Per frame: how many the stream has seen, and why it started anew."""
     pushed = [camera.push(StreamFrame(**{"image": IMAGE, **frame})) for frame in frames]
     return [(int(one.depth[0, 0]), one.reset) for one in pushed]

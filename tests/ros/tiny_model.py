@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 
 FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
 BLOCKING = (9, 8, 7)  # this one makes it say so in the pipe $TINY_ENTERED and wait for $TINY_GO
@@ -72,7 +72,7 @@ def load_tiny(name: str = "tiny", device: str = "cpu") -> GeometryModel:
     if name != "tiny":
         raise ValueError(f"model {name!r} is unknown, expected 'tiny'")
     model = TinyModel()
-    model.stabilizer = build_stabilizer(CHANNELS, StabilizerConfig(hidden=8))
+    model.stabilizer = build_dyfn(CHANNELS, DyFNConfig(hidden=8))
     generator = torch.Generator().manual_seed(7)
     with torch.no_grad():
         for parameter in model.parameters():

@@ -52,7 +52,7 @@ SEVEN_SCENES_CAMERA: Camera = (585.0, 585.0, 320.0, 240.0)
 
 
 @dataclass(frozen=True)
-class Options:
+class RgbdFolderOptions:
     """intrinsics: instead of the folder's own. depth_scale: stored values per metre instead of
     the layout's. tolerance, max_gap: seconds, for folders with stamps. max_missing: frames, for
     the others."""
@@ -100,7 +100,7 @@ def open_rgbd_folder(
     max_missing: more frames than this missing from the numbers are a cut (other layouts).
     Raises DataError without intrinsics.
     """
-    options = Options(intrinsics, depth_scale, tolerance, max_gap, max_missing)
+    options = RgbdFolderOptions(intrinsics, depth_scale, tolerance, max_gap, max_missing)
     sequences: list[FrameSequence] = []
     for folder in folders_holding(root, "rgb.txt", 2):
         views, runs = _tum(folder, options, report)
@@ -144,7 +144,7 @@ def _usual_step(numbers: list[int]) -> int:
     return steps.most_common(1)[0][0] if steps else 1
 
 
-def _plain(folder: Path, options: Options, report: DataReport) -> Views:
+def _plain(folder: Path, options: RgbdFolderOptions, report: DataReport) -> Views:
     images = numbered_files(folder / "rgb", r"(?:.*\D)?(\d+)\.(?:jpg|jpeg|png)")
     depths = numbered_files(folder / "depth", r"(?:.*\D)?(\d+)\.png")
     poses: dict[int, np.ndarray] = {}
@@ -159,7 +159,7 @@ def _plain(folder: Path, options: Options, report: DataReport) -> Views:
     return Views(files, camera, poses, options.depth_scale or 1000.0)
 
 
-def _scannet(folder: Path, options: Options, report: DataReport) -> Views:
+def _scannet(folder: Path, options: RgbdFolderOptions, report: DataReport) -> Views:
     images = numbered_files(folder / "color", r"(\d+)\.(?:jpg|png)")
     files = with_depth(images, numbered_files(folder / "depth", r"(\d+)\.png"), report)
     camera = options.intrinsics or _matrix_camera(folder / "intrinsic" / "intrinsic_color.txt", 4)
@@ -167,7 +167,7 @@ def _scannet(folder: Path, options: Options, report: DataReport) -> Views:
     return Views(files, camera, poses, options.depth_scale or 1000.0)
 
 
-def _seven_scenes(folder: Path, options: Options, report: DataReport) -> Views:
+def _seven_scenes(folder: Path, options: RgbdFolderOptions, report: DataReport) -> Views:
     images = numbered_files(folder, r"frame-(\d+)\.color\.(?:png|jpg)")
     files = with_depth(images, numbered_files(folder, r"frame-(\d+)\.depth\.png"), report)
     camera = options.intrinsics or SEVEN_SCENES_CAMERA
@@ -202,7 +202,9 @@ def _matrix_camera(path: Path, size: int) -> Camera:
     return (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
 
 
-def _tum(folder: Path, options: Options, report: DataReport) -> tuple[Views, list[list[int]]]:
+def _tum(
+    folder: Path, options: RgbdFolderOptions, report: DataReport
+) -> tuple[Views, list[list[int]]]:
     """The views, numbered in the order of time, and runs without a gap."""
     colours = list(_stamped(folder / "rgb.txt", report))
     depths = list(_stamped(folder / "depth.txt", report))

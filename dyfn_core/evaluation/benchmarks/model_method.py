@@ -13,7 +13,7 @@ from dyfn_core.evaluation.benchmarks.predictions import Predict
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.controls import latent_controls, stabilized_by
-from dyfn_core.models.dyfn import Stabilizer
+from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DISPARITY, Prediction
 from dyfn_core.stream.depth_stream import DepthStream
 
@@ -41,7 +41,7 @@ class ModelMethod:
         self.model = model
         self.num_tokens = num_tokens
         self.known_camera = known_camera
-        self._stabilizers: dict[str, Stabilizer | None] = {}
+        self._stabilizers: dict[str, DyFN | None] = {}
         if stabilize and model.stabilizer is not None:
             self._stabilizers[f"{name} + DyFN"] = model.stabilizer
         self._stabilizers[f"{name}, base"] = None

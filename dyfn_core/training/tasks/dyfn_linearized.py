@@ -15,7 +15,7 @@ from dyfn_core.prediction import StreamState
 from dyfn_core.training.config import ConfigError, ScaleRunConfig
 from dyfn_core.training.loop.processes import part_seed, share_of
 from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
-from dyfn_core.training.tasks.gru_input_cache import SummaryCache, SummaryClips
+from dyfn_core.training.tasks.gru_input_cache import GRUInputCache, GRUInputClips
 from dyfn_core.training.tasks.latent_cache import LatentClips
 from dyfn_core.training.tasks.validation import Sequence
 
@@ -43,7 +43,7 @@ class ScaleTask(StabilizerTask):
                 "stabilizer.form: corrections of the scale need the form 'residual', got "
                 f"{stabilizer.config.form!r}"
             )
-        self.summaries = SummaryCache(
+        self.summaries = GRUInputCache(
             config.cache or cache_folder,
             self.model,
             self.source,
@@ -55,17 +55,17 @@ class ScaleTask(StabilizerTask):
             stabilizer.get_buffer("usual_mean").copy_(mean)
             stabilizer.get_buffer("usual_std").copy_(std)
 
-    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[SummaryClips]:  # type: ignore[override]
+    def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[GRUInputClips]:  # type: ignore[override]
         clips = share_of(self.config.clips, parts, "clips")
         seed = part_seed(self.config.seed, part)
         return self.summaries.batches(
             start, seed, clips, self.config.length, self.config.sub_strides
         )
 
-    def images(self, batch: SummaryClips) -> int:  # type: ignore[override]
+    def images(self, batch: GRUInputClips) -> int:  # type: ignore[override]
         return batch.error.numel()
 
-    def loss(self, batch: SummaryClips) -> tuple[Tensor, dict[str, float]]:  # type: ignore[override]
+    def loss(self, batch: GRUInputClips) -> tuple[Tensor, dict[str, float]]:  # type: ignore[override]
         batch = batch.to(self.model.device)
         change = self._corrections(batch.summary.float())
         moved = (change * batch.slope.float()).sum(-1)
@@ -108,7 +108,7 @@ class ScaleTask(StabilizerTask):
             outputs.append(torch.cat([gamma, beta], -1))
         return torch.stack(outputs, 1)
 
-    def picture(self, batch: SummaryClips) -> np.ndarray:  # type: ignore[override]
+    def picture(self, batch: GRUInputClips) -> np.ndarray:  # type: ignore[override]
         """The frames of a validation clip: true depth, base and DyFN."""
         sequence = self.sequences["rendered"][0]
         return super().picture(_as_clips(sequence))

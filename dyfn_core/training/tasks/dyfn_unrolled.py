@@ -28,7 +28,7 @@ from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
 from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.dyfn import StabilizerConfig, build_stabilizer
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
 from dyfn_core.scoring.quick import known_mean, sequence_scores
 from dyfn_core.training.config import ConfigError, StabilizerRunConfig
@@ -284,6 +284,6 @@ def build_frozen(config: StabilizerRunConfig) -> GeometryModel:
         model.stabilizer.requires_grad_(True)
         return model.train()
     torch.manual_seed(config.seed)
-    described = StabilizerConfig(**{"pool": model.stabilizer_pool, **config.stabilizer})
-    model.stabilizer = build_stabilizer(model.latent_channels, described)
+    described = DyFNConfig(**{"pool": model.stabilizer_pool, **config.stabilizer})
+    model.stabilizer = build_dyfn(model.latent_channels, described)
     return model.train()

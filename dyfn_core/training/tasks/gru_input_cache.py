@@ -27,7 +27,7 @@ GRID = (6, 8)  # samples of a frame's depth, evenly spread
 
 
 @dataclass(frozen=True)
-class SummaryClips:
+class GRUInputClips:
     """B clips of T frames. summary: B x T x C (x h x w) float16, as Stabilizer.summarise gives it.
     error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any. depth,
     truth: B x T x N, the base's z and the true one (NaN where unknown) at the same N pixels. slope:
@@ -40,12 +40,12 @@ class SummaryClips:
     truth: Tensor
     slope: Tensor
 
-    def to(self, device: torch.device | str) -> SummaryClips:
+    def to(self, device: torch.device | str) -> GRUInputClips:
         """The same on another device."""
-        return SummaryClips(*(getattr(self, field.name).to(device) for field in fields(self)))
+        return GRUInputClips(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
-class SummaryCache:
+class GRUInputCache:
     """`draws` clips in a folder (CacheFolder), made once and kept in memory.
 
     unreadable: counts what could not be read while they were made. Raises ConfigError when the
@@ -63,9 +63,9 @@ class SummaryCache:
         assert model.stabilizer is not None
         wanted = fingerprint(model, source)
         wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
-        wanted["contents"] = [field.name for field in fields(SummaryClips)]
+        wanted["contents"] = [field.name for field in fields(GRUInputClips)]
         files = CacheFolder(folder, draws, wanted, "summaries")
-        files.build(source, partial(summarise_clips, model), unreadable)
+        files.build(source, partial(gru_inputs, model), unreadable)
         parts = files.load()
         self.summary = torch.cat([part["summary"] for part in parts])
         self.error, self.depth, self.truth, self.slope = (
@@ -80,7 +80,7 @@ class SummaryCache:
 
     def batches(
         self, start: int, seed: int, clips: int, length: int, strides: tuple[int, int]
-    ) -> Iterator[SummaryClips]:
+    ) -> Iterator[GRUInputClips]:
         """Endless batches, on the CPU: `length` frames, strides[0]..strides[1] apart, also
         backwards."""
         step = start
@@ -89,7 +89,7 @@ class SummaryCache:
         while True:
             draw = torch.Generator().manual_seed(seed * 1_000_003 + step)
             chosen = [self._sub_clip(length, (strides[0], longest), draw) for _ in range(clips)]
-            yield SummaryClips(*(torch.stack(parts) for parts in zip(*chosen, strict=True)))
+            yield GRUInputClips(*(torch.stack(parts) for parts in zip(*chosen, strict=True)))
             step += 1
 
     def _sub_clip(
@@ -107,8 +107,8 @@ class SummaryCache:
         return tuple(part[clip, index] for part in parts)
 
 
-def summarise_clips(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
-    """The parts of SummaryClips."""
+def gru_inputs(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
+    """The parts of GRUInputClips."""
     stabilizer = model.stabilizer
     assert stabilizer is not None
     clips = encode_clips(model, batch)

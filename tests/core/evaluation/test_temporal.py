@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dyfn_core.evaluation.temporal import (
+    PosedCamera,
     TemporalScorer,
-    View,
     flicker,
     reprojection_error,
     static_pixels,
@@ -19,10 +19,10 @@ SIZE = (48, 64)
 MATRIX = np.array([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
 
 
-def at(x: float = 0, z: float = 0) -> View:
+def at(x: float = 0, z: float = 0) -> PosedCamera:
     where = np.eye(4)
     where[:3, 3] = [x, 0, z]
-    return View(MATRIX, where)
+    return PosedCamera(MATRIX, where)
 
 
 def wall(distance: float) -> np.ndarray:
@@ -99,7 +99,7 @@ def test_flicker_is_the_relative_change_of_static_pixels() -> None:
 
 
 def push(
-    scorer: TemporalScorer, truth: np.ndarray, maps: dict[str, np.ndarray], view: View | None
+    scorer: TemporalScorer, truth: np.ndarray, maps: dict[str, np.ndarray], view: PosedCamera | None
 ) -> None:
     image = np.zeros((*SIZE, 3), np.uint8)
     pose = None if view is None else view.pose

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dyfn_core.metric.calibration import CalibrationOptions, Calibrator
+from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibrator
 from dyfn_core.metric.references import Evidence
 
 
@@ -20,7 +20,7 @@ def evidence(stamp: float, scale: float, count: int = 5, seed: int = 0) -> Evide
     return Evidence(stamp, predicted, measured)
 
 
-def play(calibrator: Calibrator, scale: float, start: float, end: float) -> list[float]:
+def play(calibrator: ScaleCalibrator, scale: float, start: float, end: float) -> list[float]:
     """Ten measurements a second; -> the scale in force after each (NaN: none)."""
     found = []
     for step in range(round(start * 10), round(end * 10)):
@@ -31,13 +31,13 @@ def play(calibrator: Calibrator, scale: float, start: float, end: float) -> list
 
 
 def test_scale_is_there_after_the_first_second_and_not_before() -> None:
-    found = play(Calibrator(), 2.5, 0, 1.5)
+    found = play(ScaleCalibrator(), 2.5, 0, 1.5)
     assert np.isnan(found[:10]).all()
     np.testing.assert_allclose(found[10:], 2.5, rtol=0.01)
 
 
 def test_hold_never_moves_and_says_when_the_reference_disagrees() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     held = play(calibrator, 2.0, 0, 2)[-1]
     assert set(play(calibrator, 3.0, 2, 4)) == {held}
     assert not calibrator.state.disagrees
@@ -52,7 +52,7 @@ def test_hold_never_moves_and_says_when_the_reference_disagrees() -> None:
 
 
 def test_short_disagreement_is_forgotten() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     play(calibrator, 2.0, 0, 2)
     for start in (2, 6, 10):
         play(calibrator, 4.0, start, start + 2)
@@ -62,7 +62,7 @@ def test_short_disagreement_is_forgotten() -> None:
 
 def test_track_follows_within_its_rate_and_arrives() -> None:
     options = CalibrationOptions("track", rate=0.02)
-    calibrator = Calibrator(options)
+    calibrator = ScaleCalibrator(options)
     play(calibrator, 2.0, 0, 2)
     before = calibrator.state.map
     assert before is not None
@@ -75,7 +75,7 @@ def test_track_follows_within_its_rate_and_arrives() -> None:
 
 
 def test_track_calibrates_anew_after_lasting_contradiction_only() -> None:
-    calibrator = Calibrator(CalibrationOptions("track"))
+    calibrator = ScaleCalibrator(CalibrationOptions("track"))
     play(calibrator, 2.0, 0, 2)
     during = play(calibrator, 6.0, 2, 4.5)
     np.testing.assert_allclose(during, 2.0, rtol=0.02)
@@ -86,7 +86,7 @@ def test_track_calibrates_anew_after_lasting_contradiction_only() -> None:
 
 
 def test_reset_forgets_the_calibration_but_not_the_counts() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     play(calibrator, 2.0, 0, 2)
     calibrator.push(Evidence(2.0, np.empty(0), np.empty(0), evidence(2.0, 1).dropped))
     calibrator.dropped["missing"] = 3
@@ -97,7 +97,7 @@ def test_reset_forgets_the_calibration_but_not_the_counts() -> None:
 
 
 def test_a_source_of_one_point_at_a_time_calibrates_once_it_has_enough() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     for step in range(12):
         assert calibrator.state.map is None or step >= 10
         calibrator.push(evidence(step * 0.5, 2.0, count=1))
@@ -106,7 +106,7 @@ def test_a_source_of_one_point_at_a_time_calibrates_once_it_has_enough() -> None
 
 
 def test_old_evidence_is_not_used_and_memory_is_bounded() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     play(calibrator, 2.0, 0, 60)
     assert len(calibrator.state.window) <= 11
     calibrator.push(evidence(1000.0, 4.0, count=3))
@@ -114,7 +114,7 @@ def test_old_evidence_is_not_used_and_memory_is_bounded() -> None:
 
 
 def test_a_clock_that_was_set_back_does_not_keep_evidence_of_the_future() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     play(calibrator, 2.0, 1000, 1002)
     play(calibrator, 2.0, 0, 3)
     assert len(calibrator.state.window) <= 11
@@ -122,7 +122,7 @@ def test_a_clock_that_was_set_back_does_not_keep_evidence_of_the_future() -> Non
 
 
 def test_empty_evidence_explains_why_there_is_no_scale() -> None:
-    calibrator = Calibrator()
+    calibrator = ScaleCalibrator()
     calibrator.push(
         Evidence(0.0, np.empty(0), np.empty(0), dropped=type(calibrator.dropped)({"missing": 4}))
     )
@@ -131,7 +131,7 @@ def test_empty_evidence_explains_why_there_is_no_scale() -> None:
 
 
 def test_shift_is_found_and_followed_when_asked_for() -> None:
-    calibrator = Calibrator(CalibrationOptions("track", fit="scale_shift"))
+    calibrator = ScaleCalibrator(CalibrationOptions("track", fit="scale_shift"))
     for step in range(20):
         predicted = np.linspace(0.5, 4, 12)
         calibrator.push(Evidence(step / 10, predicted, 2 * predicted + 0.3))
@@ -149,7 +149,7 @@ def test_tracked_scale_is_always_positive_finite_and_near_what_was_measured(
     scale: float, share: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    calibrator = Calibrator(CalibrationOptions("track"))
+    calibrator = ScaleCalibrator(CalibrationOptions("track"))
     for step in range(40):
         one = evidence(step / 10, scale, seed=seed)
         wrong = rng.random(5) < share

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_core.stream.scene_cut import SceneCutDetector, look_at, scene_difference
+from dyfn_core.stream.scene_cut import SceneCutDetector, picture_features, scene_difference
 
 
 def scene(seed: int, width: int = 480, height: int = 240) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_a_slide_show_is_one_cut_until_pictures_are_alike_again() -> None:
 
 
 def test_the_difference_is_causal_bounded_and_zero_for_the_same_picture() -> None:
-    one, other = look_at(seen(scene(0), 0)), look_at(seen(scene(1), 0))
+    one, other = picture_features(seen(scene(0), 0)), picture_features(seen(scene(1), 0))
     assert scene_difference(one, one) == pytest.approx(0, abs=1e-3)
     assert 0.5 < scene_difference(one, other) <= 1.5
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
-from dyfn_core.metric.calibration import Calibration
+from dyfn_core.metric.calibration import ScaleCalibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
 from dyfn_core.models.moge import MoGeModel
@@ -44,9 +44,9 @@ def played(model: MoGeModel, count: int = 3) -> DepthStream:
     return stream
 
 
-def calibration() -> Calibration:
+def calibration() -> ScaleCalibration:
     window = Evidence(0.1, np.array([1.0, 2.0]), np.array([2.0, 4.1]), Counter({"missing": 2}))
-    return Calibration(MetricMap(2.03), 0.01, 2, 0.1, 0.1, 0.0, (window,))
+    return ScaleCalibration(MetricMap(2.03), 0.01, 2, 0.1, 0.1, 0.0, (window,))
 
 
 def test_loaded_state_goes_on_bit_for_bit_with_another_copy_of_the_model(

@@ -11,10 +11,10 @@ from small_camera import SIZE
 from dyfn_worlds.camera.cameras import FreeSpace, pose_at
 from dyfn_worlds.camera.paths import CameraPath
 from dyfn_worlds.camera.staging import LightScript, Way, stand
-from dyfn_worlds.generate import Job, RoomWorlds, render
+from dyfn_worlds.generate import RoomWorlds, ShardJob, render
 from dyfn_worlds.maps import md3
 from dyfn_worlds.render.occlusion import occlusion
-from dyfn_worlds.render.renderer import Camera, Renderer
+from dyfn_worlds.render.renderer import RenderCamera, Renderer
 from dyfn_worlds.scene.actors import Actor, Moment, Placement
 from dyfn_worlds.scene.builder import SceneBuilder, new_vertices, stiff_actor
 
@@ -39,7 +39,7 @@ def test_an_actor_is_drawn_where_it_is_placed_and_masked(renderer: Renderer) -> 
     builder = hall()
     actor = box_actor(builder)
     renderer.load(builder.build(actors=[actor]))
-    camera = Camera(pose_at(np.array([0.0, 0, 0.5]), 0, 0, 0), (0.8, 1.06))
+    camera = RenderCamera(pose_at(np.array([0.0, 0, 0.5]), 0, 0, 0), (0.8, 1.06))
     here = renderer.draw(camera, moment=Moment((Placement(0, (3.5, 0, 0), 0.0),)))
     gone = renderer.draw(camera)
     assert here.depth[24, 32] == pytest.approx(3.0, rel=1e-4)
@@ -71,7 +71,7 @@ def test_actors_stand_on_the_floor_and_not_on_tables() -> None:
     builder.box(np.array([1.0, -0.5, 0]), np.array([2.0, 0.5, 0.7]), layer)
     actor = box_actor(builder)
     space = FreeSpace(builder.build())
-    camera = Camera(pose_at(np.array([0.0, 0, 1.5]), 0, -0.2, 0), (0.8, 1.06))
+    camera = RenderCamera(pose_at(np.array([0.0, 0, 1.5]), 0, -0.2, 0), (0.8, 1.06))
     rng = np.random.default_rng(0)
     placed = [p for _ in range(30) for p in stand(space, rng, [actor], camera, 1)]
     assert len(placed) > 5
@@ -108,7 +108,7 @@ def test_speeds_of_a_path_are_per_second() -> None:
 
 
 def test_every_frame_says_how_it_was_taken(tmp_path: Path, renderer: Renderer) -> None:
-    job = Job("rooms", 1, 0, 6, 3, SIZE)
+    job = ShardJob("rooms", 1, 0, 6, 3, SIZE)
     for name in ("a", "b"):
         render(job, RoomWorlds(tmp_path), tmp_path / name, lambda line: None)
     (meta_path,) = (tmp_path / "a").rglob("meta.json")

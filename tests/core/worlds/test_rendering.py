@@ -10,12 +10,12 @@ from small_camera import SIZE, rays
 
 from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
 from dyfn_worlds.camera.paths import random_path
-from dyfn_worlds.generate import Job, RoomWorlds, render
-from dyfn_worlds.render.renderer import Camera, Renderer
+from dyfn_worlds.generate import RoomWorlds, ShardJob, render
+from dyfn_worlds.render.renderer import RenderCamera, Renderer
 from dyfn_worlds.rooms.rooms import furnished_room
 from dyfn_worlds.scene.builder import SceneBuilder
 from dyfn_worlds.scene.scene import Light, Scene
-from dyfn_worlds.shards import DEPTH_INFINITE, View, encode_depth, write_shard
+from dyfn_worlds.shards import DEPTH_INFINITE, RenderedView, encode_depth, write_shard
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,9 @@ def room() -> Scene:
 
 def test_depth_is_the_ray_cast_z_at_every_pixel_centre(renderer: Renderer, room: Scene) -> None:
     renderer.load(room)
-    camera = Camera(pose_at(room.viewpoints[0], 0.7, -0.3, 0.2), (0.8, 0.8 * 4 / 3), (0.47, 0.55))
+    camera = RenderCamera(
+        pose_at(room.viewpoints[0], 0.7, -0.3, 0.2), (0.8, 0.8 * 4 / 3), (0.47, 0.55)
+    )
     depth = renderer.draw(camera).depth
     way = rays(camera) @ camera.pose[:3, :3].T
     length = np.linalg.norm(way, axis=-1)
@@ -43,7 +45,7 @@ def test_the_sky_is_infinite_and_a_wall_hides_it(renderer: Renderer) -> None:
     builder.quad(np.array([[2.0, 0, -9], [2, -9, -9], [2, -9, 9], [2, 0, 9]]), red)
     light = Light(np.zeros(3), np.array([1.0, 0, 0]), np.full(3, 5.0))
     renderer.load(builder.build(lights=[light]))
-    picture = renderer.draw(Camera(pose_at(np.zeros(3), 0, 0, 0), (0.7, 0.9)))
+    picture = renderer.draw(RenderCamera(pose_at(np.zeros(3), 0, 0, 0), (0.7, 0.9)))
     image, depth = picture.image, picture.depth
     left, right = depth[:, : SIZE[1] // 2], depth[:, SIZE[1] // 2 :]
     assert np.isinf(left).all()
@@ -58,7 +60,7 @@ def test_a_shadow_falls_behind_what_stands_in_the_light(renderer: Renderer) -> N
     builder.box(np.array([-0.5, -0.5, 1.0]), np.array([0.5, 0.5, 1.2]), white)
     light = Light(np.array([0, 0, 2.5]), np.array([0, 0, -1.0]), np.full(3, 8.0))
     renderer.load(builder.build(lights=[light]))
-    camera = Camera(pose_at(np.array([-4.0, 0, 0.6]), 0, -0.15, 0), (0.8, 1.06))
+    camera = RenderCamera(pose_at(np.array([-4.0, 0, 0.6]), 0, -0.15, 0), (0.8, 1.06))
     picture = renderer.draw(camera)
     image, depth = picture.image, picture.depth
     world = (rays(camera) * depth[..., None]) @ camera.pose[:3, :3].T + camera.pose[:3, 3]
@@ -69,7 +71,7 @@ def test_a_shadow_falls_behind_what_stands_in_the_light(renderer: Renderer) -> N
 
 
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, renderer: Renderer) -> None:
-    job = Job("rooms", 1, 4, 0, 5, SIZE)
+    job = ShardJob("rooms", 1, 4, 0, 5, SIZE)
     for name in ("a", "b"):
         render(job, RoomWorlds(tmp_path), tmp_path / name, lambda line: None)
     first, second = ((tmp_path / n).rglob("*.*") for n in ("a", "b"))
@@ -94,8 +96,8 @@ def test_a_path_keeps_clear_of_every_surface(room: Scene) -> None:
 def test_depth_is_stored_in_millimetres_with_sky_and_unknown_apart(tmp_path: Path) -> None:
     depth = np.array([[1.2345, np.inf], [70.0, np.nan]], np.float32)
     assert encode_depth(depth).tolist() == [[1234, DEPTH_INFINITE], [0, 0]]
-    camera = Camera(np.eye(4), (0.8, 1.0))
-    view = View(np.zeros((2, 2, 3), np.uint8), depth, camera)
+    camera = RenderCamera(np.eye(4), (0.8, 1.0))
+    view = RenderedView(np.zeros((2, 2, 3), np.uint8), depth, camera)
     write_shard(tmp_path / "s", [view], {"world": "w"})
     stored = cv2.imread(str(tmp_path / "s" / "00000.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(stored, encode_depth(depth))

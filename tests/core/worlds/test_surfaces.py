@@ -10,14 +10,14 @@ from small_camera import rays
 
 from dyfn_worlds.camera.cameras import pose_at
 from dyfn_worlds.camera.photographer import Photographer
-from dyfn_worlds.render.renderer import Camera, Look, Picture, Renderer
+from dyfn_worlds.render.renderer import Picture, RenderCamera, Renderer, Shading
 from dyfn_worlds.scene import textures
 from dyfn_worlds.scene.actors import STILL
 from dyfn_worlds.scene.builder import SceneBuilder
 from dyfn_worlds.scene.palette import Palette
 from dyfn_worlds.scene.scene import Light, Scene, Window
 
-DOWN = Camera(pose_at(np.array([2.0, 2.0, 2.5]), 0.0, -np.pi / 2, 0.0), (0.5, 0.5 * 4 / 3))
+DOWN = RenderCamera(pose_at(np.array([2.0, 2.0, 2.5]), 0.0, -np.pi / 2, 0.0), (0.5, 0.5 * 4 / 3))
 
 
 def empty_room(**fields: object) -> SceneBuilder:
@@ -32,7 +32,7 @@ def empty_room(**fields: object) -> SceneBuilder:
     return builder
 
 
-def floor_points(picture: Picture, camera: Camera) -> np.ndarray:
+def floor_points(picture: Picture, camera: RenderCamera) -> np.ndarray:
     """H x W x 3 world points of what is seen."""
     return (rays(camera) * picture.depth[..., None]) @ camera.pose[:3, :3].T + camera.pose[:3, 3]
 
@@ -49,7 +49,7 @@ def sunlit(bars: int) -> tuple[Window, Scene]:
 def test_sunlight_falls_where_the_window_lets_it_through(renderer: Renderer) -> None:
     _, scene = sunlit(bars=0)
     renderer.load(scene)
-    picture = renderer.draw(DOWN, Look(gloss=0.0))
+    picture = renderer.draw(DOWN, Shading(gloss=0.0))
     x, y, _ = np.moveaxis(floor_points(picture, DOWN), -1, 0)
     bright = picture.image.mean(axis=2) > 100
     # at 45 degrees a window from 1.0 to 2.0 m lights about 1.0 to 2.0 m of the floor
@@ -64,7 +64,7 @@ def test_a_windows_bar_is_seen_in_the_sunlight(renderer: Renderer) -> None:
     for bars in (0, 1):
         _, scene = sunlit(bars)
         renderer.load(scene)
-        picture = renderer.draw(DOWN, Look(gloss=0.0))
+        picture = renderer.draw(DOWN, Shading(gloss=0.0))
         lit.append(float((picture.image.mean(axis=2) > 100).mean()))
     assert 0.6 * lit[0] < lit[1] < 0.97 * lit[0]
 
@@ -78,9 +78,9 @@ def test_a_glossy_floor_mirrors_the_lamp_and_a_dull_one_does_not(renderer: Rende
         builder.texture(index, np.full((4, 4, 3), 60, np.uint8))
     builder.quad(np.array([[0, 0, 0.01], [4, 0, 0.01], [4, 4, 0.01], [0, 4, 0.01]]), 5)
     renderer.load(builder.build())
-    camera = Camera(pose_at(np.array([0.3, 2.0, 1.0]), 0.0, -0.35, 0.0), (0.6, 0.8))
-    dull = renderer.draw(camera, Look(gloss=0.0))
-    glossy = renderer.draw(camera, Look(gloss=0.8))
+    camera = RenderCamera(pose_at(np.array([0.3, 2.0, 1.0]), 0.0, -0.35, 0.0), (0.6, 0.8))
+    dull = renderer.draw(camera, Shading(gloss=0.0))
+    glossy = renderer.draw(camera, Shading(gloss=0.8))
     gain = glossy.image.astype(float).mean(axis=2) - dull.image.mean(axis=2)
     x, y, z = np.moveaxis(floor_points(dull, camera), -1, 0)
     # a lamp at x = 3, 2.98 m high, seen from x = 0.3, 1 m high, is mirrored at 0.3 + 2.7 / 3.98
