@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_worlds.camera.photographer import Photographer
-from dyfn_worlds.maps.casting import Cast
+from dyfn_worlds.casting import Cast
 from dyfn_worlds.maps.quake import GameFiles, MapError, load_map
 from dyfn_worlds.render.renderer import Renderer
 from dyfn_worlds.rooms.furniture import Showroom

@@ -1,18 +1,28 @@
 """Fixtures that every test may use."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
+from dyfn_core.models.moge import MoGeConfig, MoGeModel
+from tests.support.pinhole import PinholeModel
+
 THREADS = torch.get_num_threads()
+ROOT = Path(__file__).resolve().parents[1]
+# Processes that tests start find the packages, and tests.support, as this process does.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """The folder of golden files and real recordings, which not every machine has."""
-    default = Path(__file__).resolve().parents[2] / "shared"
+    default = ROOT.parent / "shared"
     path = Path(os.environ.get("DYFN_SHARED", default))
     if not path.is_dir():
         pytest.skip(f"{path} is absent: set DYFN_SHARED to the folder of golden files")
@@ -23,3 +33,44 @@ def shared_dir() -> Path:
 def same_threads() -> None:
     """Training sets the process's thread count, and the last bits of a gradient depend on it."""
     torch.set_num_threads(THREADS)
+
+
+@pytest.fixture
+def pinhole() -> PinholeModel:
+    return PinholeModel().eval()
+
+
+@pytest.fixture
+def pinhole_with_dyfn() -> PinholeModel:
+    return PinholeModel(stabilized=True).eval()
+
+
+@pytest.fixture(scope="session")
+def small_moge() -> MoGeModel:
+    """A MoGe with random weights and DyFN whose heads do something; not to be changed."""
+    torch.manual_seed(0)
+    config = MoGeConfig(
+        encoder="dinov2_vits14",
+        dim_proj=32,
+        dim_upsample=(32, 32, 32),
+        remap_output="exp",
+        num_tokens_range=(6, 12),
+    )
+    model = MoGeModel(config)
+    model.stabilizer = build_dyfn(32, DyFNConfig(hidden=8))
+    torch.nn.init.normal_(model.stabilizer.gamma_head.weight, std=0.5)
+    torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)
+    torch.nn.init.ones_(model.head.output_block[1][-1].bias)  # a mask that is mostly True
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Any:
+    """A Renderer of small_camera.SIZE; skips without OpenGL."""
+    from dyfn_worlds.render.renderer import Renderer
+    from tests.support.small_camera import SIZE
+
+    try:
+        return Renderer(SIZE)
+    except Exception as error:
+        pytest.skip(f"no headless OpenGL on this machine: {error}")

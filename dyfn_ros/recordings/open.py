@@ -33,12 +33,12 @@ from dyfn_ros.recordings.typestore import (
 from dyfn_ros.recordings.writer import RecordingWriter
 
 __all__ = [
-    "FolderRecording",
     "FrameToRecord",
     "RecordedFrame",
     "Recording",
     "RecordingError",
     "RecordingWriter",
+    "RgbdRecording",
     "image_topics",
     "open_recording",
     "write_rgbd_recording",
@@ -73,7 +73,7 @@ def open_recording(
         raise ValueError(f"stamps is {stamps!r}, expected 'header' or 'log'")
     transform = parse_pose(depth_transform, "depth_transform") if depth_transform else None
     if path.is_dir() and is_rgbd_folder(path):
-        return FolderRecording(path)
+        return RgbdRecording(path)
     storage = open_storage(path)
     topics = choose_topics(
         path, storage, image_topic, camera_info_topic, depth_topic, depth_info_topic
@@ -103,7 +103,7 @@ def image_topics(path: str | Path) -> list[str | None]:
     return [*list_image_topics(path, open_storage(path))]
 
 
-class FolderRecording:
+class RgbdRecording:
     """Frames of an RGB-D folder, as if they had been recorded at a fixed rate."""
 
     topics = Topics("rgb/", "K.txt", "depth/")

@@ -22,10 +22,10 @@ from dyfn_core.stream.scene_cut_hook import SceneCutHook
 from dyfn_core.stream.session import StreamFrame, StreamSession, stream_maker
 from dyfn_core.threads import computing_threads
 from dyfn_ros.recordings.open import (
-    FolderRecording,
     RecordedFrame,
     Recording,
     RecordingError,
+    RgbdRecording,
     open_recording,
 )
 from dyfn_ros.replay.options import ReplayOptions
@@ -116,7 +116,7 @@ def score_topic(options: ReplayOptions, recording: Recording) -> SequenceEvaluat
 def _prediction_topic(options: ReplayOptions, recording: Recording, predicted_by: Recording) -> str:
     """As it is recorded. Raises RecordingError when its scores would say nothing."""
     topic = predicted_by.topics.depth
-    if isinstance(recording, FolderRecording) or topic is None:
+    if isinstance(recording, RgbdRecording) or topic is None:
         raise RecordingError(
             f"{options.recording}: expected a recording with a topic "
             f"{options.prediction_topic} of predictions"

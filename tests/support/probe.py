@@ -16,10 +16,11 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from ros_graph import DEADLINE, NODE, RELIABLE
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+from tests.support.ros_graph import DEADLINE, NODE, RELIABLE
 
 
 class Probe:

@@ -34,7 +34,6 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-HERE = Path(__file__).parent
 DEADLINE = 240.0  # a busy machine imports torch slowly
 NODE = "/stream_depth"
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
@@ -111,7 +110,7 @@ def tiny_node(
     **parameters: Any,
 ) -> NodeProcess:
     """stream_depth with the tiny model and one inference thread."""
-    command = [sys.executable, str(HERE / "tiny_node.py"), "--ros-args"]
+    command = [sys.executable, "-m", "tests.support.tiny_node", "--ros-args"]
     values = {"model": "tiny", "device": "cpu", "threads": 1, "scene_cut_threshold": 0.0}
     values.update(parameters)  # the pictures of the tests have nothing in common
     for name, value in values.items():

@@ -7,7 +7,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING
 
-from dyfn_ros.messages import images as messages
+from dyfn_ros.node import outputs
 from dyfn_ros.node.main import main
 
 if TYPE_CHECKING:
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 
 
 def load(name: str, device: str) -> GeometryModel:
-    from tiny_model import load_tiny
+    from tests.support.tiny_model import load_tiny
 
     return load_tiny(name, device)
 
 
 def report(name: str) -> None:
     """Print each call of a message builder, so that a test sees what was built for nobody."""
-    build = getattr(messages, name)
+    build = getattr(outputs, name)
 
     def reported(*args: object) -> object:
         print(name, flush=True)
         return build(*args)
 
-    setattr(messages, name, reported)
+    setattr(outputs, name, reported)
 
 
 def die_with_parent() -> None:

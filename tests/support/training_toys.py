@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from conftest import PinholeModel
-from made_frames import write_shard
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import save_model
@@ -24,6 +22,8 @@ from dyfn_core.training.config import RunConfig
 from dyfn_core.training.loop.processes import Processes, share_of
 from dyfn_core.training.loop.trainer import Trainer
 from dyfn_core.training.tasks.task import Task
+from tests.support.made_frames import write_shard
+from tests.support.pinhole import PinholeModel
 
 BATCH = 4
 PATIENCE = 300.0  # seconds for what another process does
@@ -136,7 +136,7 @@ def tiny_stabilizer_settings(place: Path) -> dict[str, Any]:
 
 def environment() -> dict[str, str]:
     """What a subprocess needs to find this module and to compute as this process does."""
-    places = [str(Path(__file__).parent), *filter(None, sys.path)]
+    places = [str(Path(__file__).parents[2]), *filter(None, sys.path)]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(places), "OMP_NUM_THREADS": "1"}
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_camera import SIZE
 
 from dyfn_worlds.camera.cameras import FreeSpace, pose_at
 from dyfn_worlds.camera.paths import CameraPath
@@ -17,6 +16,7 @@ from dyfn_worlds.render.occlusion import occlusion
 from dyfn_worlds.render.renderer import RenderCamera, Renderer
 from dyfn_worlds.scene.actors import Actor, Moment, Placement
 from dyfn_worlds.scene.builder import SceneBuilder, new_vertices, stiff_actor
+from tests.support.small_camera import SIZE
 
 
 def box_actor(builder: SceneBuilder) -> Actor:

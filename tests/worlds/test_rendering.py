@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_camera import SIZE, rays
 
 from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
 from dyfn_worlds.camera.paths import random_path
@@ -16,6 +15,7 @@ from dyfn_worlds.rooms.rooms import furnished_room
 from dyfn_worlds.scene.builder import SceneBuilder
 from dyfn_worlds.scene.scene import Light, Scene
 from dyfn_worlds.shards import DEPTH_INFINITE, RenderedView, encode_depth, write_shard
+from tests.support.small_camera import SIZE, rays
 
 
 @pytest.fixture(scope="module")

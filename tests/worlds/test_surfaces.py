@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from small_camera import rays
 
 from dyfn_worlds.camera.cameras import pose_at
 from dyfn_worlds.camera.photographer import Photographer
@@ -16,6 +15,7 @@ from dyfn_worlds.scene.actors import STILL
 from dyfn_worlds.scene.builder import SceneBuilder
 from dyfn_worlds.scene.palette import Palette
 from dyfn_worlds.scene.scene import Light, Scene, Window
+from tests.support.small_camera import rays
 
 DOWN = RenderCamera(pose_at(np.array([2.0, 2.0, 2.5]), 0.0, -np.pi / 2, 0.0), (0.5, 0.5 * 4 / 3))
 

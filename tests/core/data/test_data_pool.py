@@ -10,17 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from made_data_sets import (
-    BALL,
-    FLOOR,
-    RADIUS,
-    View,
-    make_point_odyssey,
-    view,
-    write_jpeg,
-    write_png,
-)
-from made_frames import write_data_set
 from scipy.spatial.transform import Rotation
 
 from dyfn_core.data.clips import (
@@ -36,6 +25,17 @@ from dyfn_core.data.frames import DataError, FrameError, NumberedSequence, RgbdF
 from dyfn_core.data.pool import DataPool, DataSpec, cut_sequences, open_pool
 from dyfn_core.training.config import BaseRunConfig, ConfigError, read_config
 from dyfn_core.training.tasks.validation import spread_examples
+from tests.support.made_data_sets import (
+    BALL,
+    FLOOR,
+    RADIUS,
+    View,
+    make_point_odyssey,
+    view,
+    write_jpeg,
+    write_png,
+)
+from tests.support.made_frames import write_data_set
 
 SIZE = (48, 64)
 CAMERA = (50.0, 52.0, 31.0, 25.0)  # the first pixel's corner at 0

@@ -9,10 +9,10 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from made_data_sets import BALL, FLOOR, MAKERS, PATCH, RADIUS, MadeSet, View
 
 from dyfn_core.data.datasets import open_kind
 from dyfn_core.data.frames import DataError, FrameError, RgbdFrame
+from tests.support.made_data_sets import BALL, FLOOR, MAKERS, PATCH, RADIUS, MadeSet, View
 
 
 @pytest.fixture(scope="module", params=list(MAKERS))

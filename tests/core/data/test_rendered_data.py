@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_frames import INTRINSICS, SIZE, made_frame, write_data_set, write_shard
 
 from dyfn_core.data.augment import apply_appearance, apply_crop, draw_appearance, draw_crop
 from dyfn_core.data.clips import ClipSource, SizeStage, draw_batch, find_sequences
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import decode_depth, encode_depth, list_shards, read_shard
+from tests.support.made_frames import INTRINSICS, SIZE, made_frame, write_data_set, write_shard
 
 
 def source(root: Path, **changes: object) -> ClipSource:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from made_benchmarks import PATCH, depth, make_scannet, make_sintel, make_tum, make_video
 
 from dyfn_core.cli import eval as cli
 from dyfn_core.evaluation.benchmarks.long_sequence import length_table, long_sequences
@@ -31,6 +30,14 @@ from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.controls import ema_control, frozen_control, stabilized_by
 from dyfn_core.scoring.protocols import LEAST_SQUARES, SequenceScorer, least_squares
 from dyfn_core.stream.depth_stream import DepthStream
+from tests.support.made_benchmarks import (
+    PATCH,
+    depth,
+    make_scannet,
+    make_sintel,
+    make_tum,
+    make_video,
+)
 
 TUM = (24, 32)
 

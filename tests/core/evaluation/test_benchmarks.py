@@ -7,7 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_benchmarks import (
+
+from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.evaluation.benchmarks.registry import (
+    BENCHMARKS,
+    BenchmarkFrame,
+    BenchmarkSequence,
+    Settings,
+    open_benchmark,
+)
+from tests.support.made_benchmarks import (
     KITTI_SIZE,
     PATCH,
     SCANNET_CAMERA,
@@ -27,15 +36,6 @@ from made_benchmarks import (
     pose,
     write_depth,
     write_image,
-)
-
-from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmarks.registry import (
-    BENCHMARKS,
-    BenchmarkFrame,
-    BenchmarkSequence,
-    Settings,
-    open_benchmark,
 )
 
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from conftest import PinholeModel, picture
 
 from dyfn_core.evaluation.variants import VARIANTS, gap_closed, score_variants, variant_table
 from dyfn_core.models.controls import StatisticsControl, ema_control, frozen_control, stabilized_by
+from tests.support.pinhole import PinholeModel, picture
 
 
 def statistics(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

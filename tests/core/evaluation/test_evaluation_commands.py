@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from conftest import PinholeModel
-from made_room import FOCAL, SIZE, room_frame
 
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval import main
 from dyfn_core.evaluation.empirical_study import statistics_grid
 from dyfn_core.models.base import Latent
+from tests.support.made_room import FOCAL, SIZE, room_frame
+from tests.support.pinhole import PinholeModel
 
 FRAMES = 12
 

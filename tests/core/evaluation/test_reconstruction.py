@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import PinholeModel
-from made_room import ExactMatcher, RoomSequence, camera_pose, room_frame
 
 from dyfn_core.data.frames import FrameError
 from dyfn_core.evaluation.reconstruction.cloud_error import cloud_error, write_ply
@@ -31,6 +29,8 @@ from dyfn_core.evaluation.reconstruction.runs import (
 )
 from dyfn_core.evaluation.reconstruction.trajectory import trajectory_error
 from dyfn_core.geometry.registration import RegistrationError, Similarity
+from tests.support.made_room import ExactMatcher, RoomSequence, camera_pose, room_frame
+from tests.support.pinhole import PinholeModel
 
 FRAMES = 16
 OPTIONS = ReconstructionOptions(offsets=(1, 3, 7))

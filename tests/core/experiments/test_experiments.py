@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from training_toys import tiny_base, tiny_stabilizer_settings
 
 from dyfn_core.cli.train import main
 from dyfn_core.evaluation.empirical_study import change_statistics, statistics_grid
@@ -19,8 +18,9 @@ from dyfn_core.experiments.report import ArmScores, trained_table, verdicts, wri
 from dyfn_core.models.base import Latent
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.training.config import StabilizerRunConfig, read_config
+from tests.support.training_toys import tiny_base, tiny_stabilizer_settings
 
-CONFIG = Path(__file__).resolve().parents[2] / "config" / "train_experiments.yaml"
+CONFIG = Path(__file__).resolve().parents[3] / "config" / "train_experiments.yaml"
 
 
 @pytest.fixture(scope="module")

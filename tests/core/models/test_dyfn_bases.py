@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from made_frames import write_data_set
 
 from dyfn_core.cli.train import main
 from dyfn_core.models.base import GeometryModel
@@ -17,6 +16,7 @@ from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.models.depth_anything import DepthAnythingConfig, DepthAnythingModel
 from dyfn_core.models.mini import MiniConfig, MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
+from tests.support.made_frames import write_data_set
 
 RUN = {
     "kinds": ["clip"],

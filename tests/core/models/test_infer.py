@@ -8,11 +8,11 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from conftest import FOV_X, PinholeModel, picture
 
 from dyfn_core.geometry.camera import fov_from_intrinsics
 from dyfn_core.models.moge import MoGeModel, resized, whole_patches
 from dyfn_core.prediction import Prediction
+from tests.support.pinhole import FOV_X, PinholeModel, picture
 
 
 def noise(seed: int, *size: int) -> np.ndarray:

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import FOV_X, PinholeModel, picture
 
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction, StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, RobustMean, push_together
+from tests.support.pinhole import FOV_X, PinholeModel, picture
 
 FOCAL = 32 / np.tan(np.radians(FOV_X / 2))
 CAMERA = np.array([[FOCAL, 0, 31.5], [0, FOCAL, 23.5], [0, 0, 1]])

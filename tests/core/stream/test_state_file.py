@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import PinholeModel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
@@ -31,6 +30,7 @@ from dyfn_core.stream.state_file import (
     restore,
     save_stream,
 )
+from tests.support.pinhole import PinholeModel
 
 
 def noise(seed: int, height: int = 50, width: int = 60) -> np.ndarray:

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_model import load_tiny
 
 from dyfn_core.stream.scene_cut_hook import SceneCutHook
 from dyfn_core.stream.session import StreamFrame, StreamSession, stream_maker
 from dyfn_core.stream.state_hook import StateError, StateHook, path_for
 from dyfn_ros.node.metric_scale import MetricHook
 from dyfn_ros.node.parameters.table import Settings
+from tests.support.tiny_model import load_tiny
 
 
 class Ports:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from training_toys import tiny_base, tiny_stabilizer_settings
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
@@ -25,6 +24,7 @@ from dyfn_core.training.tasks.gru_input_cache import (
     scale_slope,
 )
 from dyfn_core.training.tasks.latent_cache import encode_clips
+from tests.support.training_toys import tiny_base, tiny_stabilizer_settings
 
 
 @pytest.fixture(scope="module")

@@ -16,14 +16,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from made_frames import write_shard
-from training_toys import (
-    PATIENCE,
-    environment,
-    tiny_base,
-    tiny_stabilizer_settings,
-    wait_for_step,
-)
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
@@ -38,6 +30,14 @@ from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.scaling_curve import images_at, last_doubling
 from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
 from dyfn_core.training.tasks.latent_cache import encode_clips
+from tests.support.made_frames import write_shard
+from tests.support.training_toys import (
+    PATIENCE,
+    environment,
+    tiny_base,
+    tiny_stabilizer_settings,
+    wait_for_step,
+)
 
 
 @pytest.fixture(scope="module")

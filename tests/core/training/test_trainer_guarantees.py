@@ -13,9 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-import training_toys
 import yaml
-from training_toys import PATIENCE, ToyTask, environment, run_toy, toy_config, wait_for_step
 
 from dyfn_core.models.checkpoints import read_checkpoint
 from dyfn_core.training.loop.checkpoint import (
@@ -28,6 +26,15 @@ from dyfn_core.training.loop.checkpoint import (
 from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.loop.run_state import moments
 from dyfn_core.training.loop.trainer import InterruptedRunError, Trainer, TrainingError
+from tests.support import training_toys
+from tests.support.training_toys import (
+    PATIENCE,
+    ToyTask,
+    environment,
+    run_toy,
+    toy_config,
+    wait_for_step,
+)
 
 LONG: dict[str, Any] = {"steps": 120, "validate_every": 50, "picture_every": 1000}
 

@@ -13,18 +13,8 @@ from typing import Any
 
 import pytest
 import torch
-import training_toys
 import yaml
 from safetensors.torch import save_file
-from training_toys import (
-    PATIENCE,
-    ToyTask,
-    environment,
-    run_toy,
-    tiny_base,
-    tiny_stabilizer_settings,
-    toy_config,
-)
 
 from dyfn_core.cli import train
 from dyfn_core.models.checkpoints import read_checkpoint
@@ -34,6 +24,16 @@ from dyfn_core.training.loop.processes import Processes
 from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.tasks import latent_cache as latents
 from dyfn_core.training.tasks.latent_cache import CacheFolder
+from tests.support import training_toys
+from tests.support.training_toys import (
+    PATIENCE,
+    ToyTask,
+    environment,
+    run_toy,
+    tiny_base,
+    tiny_stabilizer_settings,
+    toy_config,
+)
 
 TOLERANCE = 2e-6  # float32 sums in another order, after six steps of AdamW at 1e-2
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from made_frames import write_data_set
 
 from dyfn_core.cli.train import main
 from dyfn_core.models.checkpoints import load_model
@@ -22,8 +21,9 @@ from dyfn_core.training.config import (
 from dyfn_core.training.loop.trainer import Trainer, TrainingError
 from dyfn_core.training.tasks.base import BaseTask
 from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from tests.support.made_frames import write_data_set
 
-CONFIGS = Path(__file__).resolve().parents[2] / "config"
+CONFIGS = Path(__file__).resolve().parents[3] / "config"
 TINY = {
     "model": {"latent_channels": 16, "stage_channels": [16, 8], "context_channels": 24},
     "stages": [{"from_step": 0, "batch": 2, "sizes": [[32, 64]]}],

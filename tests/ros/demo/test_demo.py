@@ -9,16 +9,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_graph import DEADLINE, HERE, own_domain
-from test_replay import rgbd
-from tiny_model import load_tiny
 
 from dyfn_ros.demo.cli import FAILED, OK, UNUSABLE, main
 from dyfn_ros.demo.node_process import LiveError, NodeExitError, NodeProcess
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
 from dyfn_ros.replay import run as replay
+from tests.support.rgbd_frames import rgbd
+from tests.support.ros_graph import DEADLINE, own_domain
+from tests.support.tiny_model import load_tiny
 
-TINY_NODE = [sys.executable, str(HERE / "tiny_node.py")]
+TINY_NODE = [sys.executable, "-m", "tests.support.tiny_node"]
 
 
 def play(recording: Path, out: Path, command: list[str], model: str = "tiny") -> int:

@@ -1,7 +1,6 @@
 """Pictures that claim absurd sizes are refused by their header, before OpenCV takes memory."""
 
 import struct
-import zlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NoReturn
@@ -17,18 +16,7 @@ from dyfn_ros.messages.picture_size import MAX_PIXELS, PNG, check_picture_size
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, compressed_message
 from dyfn_ros.recordings.writer import RecordingWriter
-
-
-def png(width: int, height: int, bits: int = 8, colour: int = 2) -> bytes:
-    """What its header says, and next to no pixels."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        check = struct.pack(">I", zlib.crc32(name + data))
-        return struct.pack(">I", len(data)) + name + data + check
-
-    size = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
-    pixels = zlib.compress(bytes(100_000))
-    return PNG + chunk(b"IHDR", size) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+from tests.support.made_pictures import png
 
 
 def jpeg(width: int, height: int, frame: int = 0xC0, before: bytes = b"") -> bytes:

@@ -9,13 +9,19 @@ import numpy as np
 import pytest
 import torch
 from diagnostic_msgs.msg import DiagnosticArray
-from probe import Probe, stamp_of, stamped, statuses
 from rclpy.qos import (
     DurabilityPolicy,
     QoSProfile,
     ReliabilityPolicy,
 )
-from ros_graph import (
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+
+from dyfn_core.geometry.edges import flying_pixels
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.compressed_depth import decode_compressed_depth
+from tests.support.probe import Probe, stamp_of, stamped, statuses
+from tests.support.ros_graph import (
     NODE,
     NodeProcess,
     camera_info,
@@ -24,13 +30,7 @@ from ros_graph import (
     own_domain,
     tiny_node,
 )
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
-from tiny_model import FAILING, load_tiny
-
-from dyfn_core.geometry.edges import flying_pixels
-from dyfn_core.stream.depth_stream import DepthStream
-from dyfn_ros.messages import images as messages
-from dyfn_ros.messages.compressed_depth import decode_compressed_depth
+from tests.support.tiny_model import FAILING, load_tiny
 
 BOTH = ("front", "left")
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

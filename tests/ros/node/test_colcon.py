@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 from rclpy.qos import qos_profile_sensor_data
-from ros_graph import Client, NodeProcess, frames, own_domain
 
 from dyfn_core.models import save_model
 from dyfn_core.models.mini import MiniConfig, MiniModel
+from tests.support.ros_graph import Client, NodeProcess, frames, own_domain
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TESTS = ("tests/ros/test_encodings.py", "tests/ros/test_compressed_depth.py")
 PARTS = ("dyfn_core", "dyfn_ros", "resource", "launch", "config")
 FILES = ("package.xml", "setup.py", "setup.cfg", "LICENSE", "README.md")

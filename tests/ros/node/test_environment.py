@@ -88,7 +88,7 @@ def test_a_profile_in_the_working_directory_stays_the_only_one(variables: dict[s
 def test_fast_dds_accepts_the_profile(tmp_path: Path) -> None:
     clean = {key: value for key, value in os.environ.items() if "PROFILES_FILE" not in key}
     clean |= {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "91"}
-    clean["PYTHONPATH"] = str(Path(__file__).resolve().parents[2])
+    clean["PYTHONPATH"] = str(Path(__file__).resolve().parents[3])
     done = subprocess.run(
         [sys.executable, "-c", PARTICIPANT],
         env=clean,

@@ -9,12 +9,20 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from probe import Probe, stamp_of, stamped, statuses
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from ros_graph import RELIABLE, NodeProcess, frames, image_message, own_domain, tiny_node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, PointCloud2
 from std_srvs.srv import Trigger
+
+from tests.support.probe import Probe, stamp_of, stamped, statuses
+from tests.support.ros_graph import (
+    RELIABLE,
+    NodeProcess,
+    frames,
+    image_message,
+    own_domain,
+    tiny_node,
+)
 
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

@@ -14,7 +14,12 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from ros_graph import (
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from dyfn_ros.messages import images as messages
+from tests.support.ros_graph import (
     NODE,
     RELIABLE,
     Client,
@@ -24,11 +29,6 @@ from ros_graph import (
     own_domain,
     tiny_node,
 )
-from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import Float64
-from std_srvs.srv import Trigger
-
-from dyfn_ros.messages import images as messages
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

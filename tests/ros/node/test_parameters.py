@@ -13,7 +13,7 @@ from dyfn_ros.node.parameters import docs as parameter_docs
 from dyfn_ros.node.parameters.declare import check, check_cameras, usage
 from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, Settings
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:

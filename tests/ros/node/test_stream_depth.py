@@ -15,7 +15,12 @@ import pytest
 import torch
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
-from ros_graph import (
+from sensor_msgs.msg import CompressedImage, Image
+
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_ros.messages import images as messages
+from tests.support.made_pictures import png
+from tests.support.ros_graph import (
     DEADLINE,
     NODE,
     Client,
@@ -27,12 +32,7 @@ from ros_graph import (
     own_domain,
     tiny_node,
 )
-from sensor_msgs.msg import CompressedImage, Image
-from test_picture_size import png
-from tiny_model import BLOCKING, FAILING, load_tiny
-
-from dyfn_core.stream.depth_stream import DepthStream
-from dyfn_ros.messages import images as messages
+from tests.support.tiny_model import BLOCKING, FAILING, load_tiny
 
 
 class Graph:

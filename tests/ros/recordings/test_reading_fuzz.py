@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from made_recordings import MAKERS, make, shade
 
 from dyfn_ros.recordings.open import RecordingError, open_recording
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
+from tests.support.made_recordings import MAKERS, make, shade
 
 COUNT = 5
 CAMERA = np.array([[40.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])

@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from made_recordings import (
+
+from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.storage.base import MOST_LOSSES, Recorded, decompress
+from dyfn_ros.recordings.storage.chunked import MAX_OPEN, Span, merged
+from dyfn_ros.recordings.storage.open import is_recording, open_storage
+from dyfn_ros.recordings.typestore import IMAGE
+from tests.support.made_recordings import (
     MAKERS,
     TOPIC,
     image_bytes,
@@ -20,13 +27,6 @@ from made_recordings import (
     stamp_ns,
     write_mcap,
 )
-
-from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.open import open_recording
-from dyfn_ros.recordings.storage.base import MOST_LOSSES, Recorded, decompress
-from dyfn_ros.recordings.storage.chunked import MAX_OPEN, Span, merged
-from dyfn_ros.recordings.storage.open import is_recording, open_storage
-from dyfn_ros.recordings.typestore import IMAGE
 
 COUNT = 24
 

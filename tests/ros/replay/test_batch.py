@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_model import load_tiny
 
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
@@ -17,7 +16,9 @@ from dyfn_ros.replay.batch import expand, is_many, plan, run_locally
 from dyfn_ros.replay.batch_summary import mean_of
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import CRASHED, Outcome
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, Options, replay
+from dyfn_ros.replay.options import ReplayOptions
+from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, replay
+from tests.support.tiny_model import load_tiny
 
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
 
@@ -87,14 +88,14 @@ def test_a_list_names_recordings_beside_it(walks: Path) -> None:
 
 def test_equal_names_get_folders_of_their_own(tmp_path: Path) -> None:
     paths = [tmp_path / one / "walk.mcap" for one in ("x", "y", "x")]
-    jobs = plan(paths, Options(tmp_path, tmp_path / "out"), "sum")
+    jobs = plan(paths, ReplayOptions(tmp_path, tmp_path / "out"), "sum")
     assert [job.name for job in jobs] == ["walk", "y_walk", "x_walk"]
     assert len({job.options.out for job in jobs}) == 3
 
 
 def test_the_key_is_of_options_model_and_files(walks: Path, tmp_path: Path) -> None:
     def key(checksum: str = "sum", **changed: object) -> str:
-        options = Options(walks, tmp_path / "out", **changed)  # type: ignore[arg-type]
+        options = ReplayOptions(walks, tmp_path / "out", **changed)  # type: ignore[arg-type]
         return plan([walks / "b.mcap"], options, checksum)[0].key
 
     first = key()
@@ -180,13 +181,13 @@ def test_a_worker_that_dies_takes_no_other_along(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "die").touch()
-    options = Options(walks, tmp_path / "out", model="tiny", write=())
+    options = ReplayOptions(walks, tmp_path / "out", model="tiny", write=())
     jobs = plan([walks / "a", walks / "c"], options, "sum")
     found = {outcome.code: (job, outcome) for job, outcome in run_locally(jobs, dying_loader, 2)}
     assert found[CRASHED][1] == Outcome(CRASHED, "its process ended with code -9")
     survivor = found[ALL][0].options
     other = json.loads((survivor.out / "metrics.json").read_text())
-    alone = Options(survivor.recording, tmp_path / "alone", model="tiny", write=())
+    alone = ReplayOptions(survivor.recording, tmp_path / "alone", model="tiny", write=())
     assert other["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
 
 
@@ -197,14 +198,13 @@ def test_ray_does_the_same(
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_DISABLE_IMPORT_WARNING", "1")
-    source = Path(__file__).parents[2]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(source)]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[3]))
     (walks / "broken.mcap").write_bytes(b"nothing of the kind")
     chosen = [walks / "a", walks / "broken.mcap"]
     assert run(tmp_path / "out", *chosen, "--ray", "local") == PARTIAL
     assert "broken.mcap: failed (code 2)" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "a" / "metrics.json").read_text())
-    alone = Options(walks / "a", tmp_path / "alone", model="tiny", write=())
+    alone = ReplayOptions(walks / "a", tmp_path / "alone", model="tiny", write=())
     assert found["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
 
 

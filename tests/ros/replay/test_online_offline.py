@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from ros_graph import DEADLINE, own_domain
 
 from dyfn_ros.demo.node_process import NodeProcess
 from dyfn_ros.messages.images import decode_depth
@@ -22,6 +21,7 @@ from dyfn_ros.node.environment import prepare_environment
 from dyfn_ros.recordings.open import RecordedFrame, open_recording
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
+from tests.support.ros_graph import DEADLINE, own_domain
 
 COUNT, SIZE = 12, (240, 320)
 CAMERA = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])

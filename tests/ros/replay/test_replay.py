@@ -12,7 +12,6 @@ import pytest
 import torch
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
-from tiny_model import load_tiny
 
 from dyfn_core.evaluation.benchmarks.model_method import as_array
 from dyfn_core.geometry.alignment import fit_scale_shift
@@ -26,21 +25,10 @@ from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, load, parse
-
-SIZE = (36, 48)
-CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
-
-
-def rgbd(count: int, truth: bool = True) -> list[FrameToRecord]:
-    rng = np.random.default_rng(3)
-    made = []
-    for index in range(count):
-        image = cv2.resize(rng.integers(0, 255, (5, 6, 3), np.uint8), SIZE[::-1])
-        depth = cv2.resize(rng.uniform(1, 4, (4, 5)), SIZE[::-1])
-        depth[:3] = 0
-        made.append(FrameToRecord(image, depth if truth else None, CAMERA, None, 50 + index / 15))
-    return made
+from dyfn_ros.replay.options import parse
+from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, load
+from tests.support.rgbd_frames import CAMERA, SIZE, rgbd
+from tests.support.tiny_model import load_tiny
 
 
 @pytest.fixture

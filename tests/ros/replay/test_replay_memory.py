@@ -8,8 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from test_replay_outputs import CAMERA, SIZE, WALL, camera_pose
-from tiny_model import load_tiny
 
 from dyfn_core.evaluation.report import worst_frames
 from dyfn_core.geometry import voxel_grid
@@ -17,6 +15,8 @@ from dyfn_core.scoring import protocols
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.run import ALL
+from tests.support.tiny_model import load_tiny
+from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
 
 SHORT, LONG = 30, 150  # frames
 ROUND = 10  # frames until the camera is where it was

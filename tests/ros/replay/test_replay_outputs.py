@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
-from tiny_model import load_tiny
 
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_core.stream.session import Geometry
@@ -29,18 +28,8 @@ from dyfn_ros.replay.outputs import FILES, OutputOptions, ReplayOutputs
 from dyfn_ros.replay.rerun import ROOM
 from dyfn_ros.replay.run import ALL, UNUSABLE
 from dyfn_ros.replay.video import Alignment
-
-SIZE = (36, 48)
-CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
-WALL = 4.02  # metres from the origin along the world's z; on no border of voxels
-
-
-def camera_pose(index: int) -> np.ndarray:
-    """Walks towards the wall and turns about the optical axis."""
-    made = np.eye(4)
-    made[:3, :3] = Rotation.from_euler("z", 5 * index, degrees=True).as_matrix()
-    made[:3, 3] = [0.1 * index, 0, 0.3 * index]
-    return made
+from tests.support.tiny_model import load_tiny
+from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
 
 
 def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[FrameToRecord]:

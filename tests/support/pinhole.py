@@ -1,18 +1,16 @@
-"""Fixtures of the core's tests: a small geometry model that is right by construction."""
+"""A small geometry model that is right by construction, and pictures for it."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
-from dyfn_core.models.moge import MoGeConfig, MoGeModel
 
 FOV_X = 70.0
 
@@ -66,45 +64,3 @@ def picture(seed: int = 0, shift: float = 0.0, size: tuple[int, int] = (48, 64))
     red = 0.5 + 0.2 * np.sin(x + phase[0]) + 0.2 * np.cos(y + phase[1])
     image = np.stack([red, np.full(size, shift), np.zeros(size)], axis=-1)
     return np.round(image * 255).astype(np.uint8)
-
-
-@pytest.fixture
-def pinhole() -> PinholeModel:
-    return PinholeModel().eval()
-
-
-@pytest.fixture
-def pinhole_with_dyfn() -> PinholeModel:
-    return PinholeModel(stabilized=True).eval()
-
-
-@pytest.fixture(scope="session")
-def small_moge() -> MoGeModel:
-    """A MoGe with random weights and DyFN whose heads do something; not to be changed."""
-    torch.manual_seed(0)
-    config = MoGeConfig(
-        encoder="dinov2_vits14",
-        dim_proj=32,
-        dim_upsample=(32, 32, 32),
-        remap_output="exp",
-        num_tokens_range=(6, 12),
-    )
-    model = MoGeModel(config)
-    model.stabilizer = build_dyfn(32, DyFNConfig(hidden=8))
-    torch.nn.init.normal_(model.stabilizer.gamma_head.weight, std=0.5)
-    torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)
-    torch.nn.init.ones_(model.head.output_block[1][-1].bias)  # a mask that is mostly True
-    return model.eval()
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Any:
-    """A Renderer of small_camera.SIZE; skips without OpenGL."""
-    from small_camera import SIZE
-
-    from dyfn_worlds.render.renderer import Renderer
-
-    try:
-        return Renderer(SIZE)
-    except Exception as error:
-        pytest.skip(f"no headless OpenGL on this machine: {error}")

@@ -1,0 +1,1 @@
+"""What several test files share: made data, small models, a ROS graph."""
