@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -19,14 +19,23 @@ from dyfn_core.stream.session import (
 )
 
 if TYPE_CHECKING:
+    from dyfn_core.metric.calibration import ScaleCalibration
     from dyfn_core.models.base import GeometryModel
     from dyfn_core.stream.scene_cut_hook import SceneCutHook
     from dyfn_core.stream.state_file import SavedStream
-    from dyfn_ros.node.metric_scale import MetricHook
 
 
 class StateError(ValueError):
     """The state cannot be saved or loaded; the text says why."""
+
+
+class Calibrated(Protocol):
+    """A hook that holds a metric calibration; `state` is all that it remembers."""
+
+    @property
+    def state(self) -> ScaleCalibration: ...
+
+    def restore(self, state: ScaleCalibration | None) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,7 @@ class StateHook(StreamHook):
     """
 
     def __init__(
-        self, stream: StreamSession, metric: MetricHook, cut: SceneCutHook, model: GeometryModel
+        self, stream: StreamSession, metric: Calibrated, cut: SceneCutHook, model: GeometryModel
     ) -> None:
         from dyfn_core.stream.state_file import model_fingerprint
 
