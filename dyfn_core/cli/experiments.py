@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -151,8 +150,8 @@ def _statistics(runner: Runner, write: Path | None) -> list[str]:
     return [grid_table(grid), f"{grid.frames} frames.", figure]
 
 
-def _command(experiment: Experiment, options: argparse.Namespace) -> str:
-    """What to type to get the table again; of absolute paths, which differ, the name alone."""
+def _command(experiment: Experiment, options: argparse.Namespace) -> list[str]:
+    """The words to type to get the table again; of an absolute path its name alone."""
     words = ["dyfn-train", "experiments", experiment.name, "--config", _shown(options.config)]
     words += ["--base", _shown(Path(options.base))] if options.base else []
     words += [word for path in options.recording for word in ("--recording", _shown(path))]
@@ -163,7 +162,7 @@ def _command(experiment: Experiment, options: argparse.Namespace) -> str:
     given = [setting for setting in options.set if "=/" not in setting and "[/" not in setting]
     words += [word for setting in given for word in ("--set", setting)]
     words += ["--write", _shown(options.write)] if options.write else []
-    return shlex.join(words)
+    return words
 
 
 def _shown(path: Path) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shlex
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -17,29 +19,28 @@ from dyfn_core.experiments.scenes import BASE_ROWS
 
 HEADING = "## Experiments"
 METRICS = ("image_abs_rel", "video_abs_rel", "video_delta1")
+TEXT_WIDTH = 100
 TITLES = ("image AbsRel", "video AbsRel", "video delta1", "gap closed")
 
 
 def trained_table(
     controls: Mapping[str, Mapping[str, VariantScore]], arms: Mapping[str, ArmScores]
 ) -> str:
-    """Controls, then arms as mean ± standard deviation over seeds; four columns a data set."""
-    head = ["", *(f"{data} {title}" for data in controls for title in TITLES)]
-    lines = [f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}"]
-    for name in BASE_ROWS:
-        cells = [name]
-        for row in controls.values():
-            cells += [f"{getattr(row[name], metric):.3f}" for metric in METRICS]
+    """One table for each data set: the controls, then the arms as mean ± deviation over seeds."""
+    tables = []
+    for data, row in controls.items():
+        lines = [f"| {' | '.join([data, *TITLES])} |", f"|{' --- |' * (len(TITLES) + 1)}"]
+        for name in BASE_ROWS:
+            cells = [name, *(f"{getattr(row[name], metric):.3f}" for metric in METRICS)]
             learned = name in ("ema", "frozen")
             closed = [100 * gap_closed(dict(row), name)]
             cells.append(mean_spread(closed, digits=0, unit="%") if learned else "")
-        lines.append(f"| {' | '.join(cells)} |")
-    for name, arm in arms.items():
-        cells = [f"**{name}**"]
-        for data, row in controls.items():
-            cells += _arm_cells(row, arm.scores.get(data, []))
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            lines.append(f"| {' | '.join(cells)} |")
+        for name, arm in arms.items():
+            cells = [f"**{name}**", *_arm_cells(row, arm.scores.get(data, []))]
+            lines.append(f"| {' | '.join(cells)} |")
+        tables.append("\n".join(lines))
+    return "\n\n".join(tables)
 
 
 def _arm_cells(controls: Mapping[str, VariantScore], scores: Sequence[VariantScore]) -> list[str]:
@@ -114,10 +115,28 @@ def grid_table(grid: StatisticsGrid) -> str:
     return "\n".join(lines)
 
 
-def section(experiment: Experiment, body: Sequence[str], command: str) -> str:
-    """The text of one experiment."""
-    parts = [f"### {experiment.question}", *body, f"    {command}", f"Paper: {experiment.paper}"]
+def section(experiment: Experiment, body: Sequence[str], command: Sequence[str]) -> str:
+    """The text of one experiment; `command` is the words that make its tables again."""
+    paper = textwrap.fill(f"Paper: {experiment.paper}", TEXT_WIDTH)
+    parts = [f"### {experiment.question}", *body, _shown_command(command), paper]
     return "\n\n".join(parts)
+
+
+def _shown_command(words: Sequence[str]) -> str:
+    """A command as an indented block; a long one is broken between its options."""
+    options: list[str] = []
+    for word in map(shlex.quote, words):
+        if word.startswith("--") or not options:
+            options.append(word)
+        else:
+            options[-1] += f" {word}"
+    lines = [f"    {options[0]}"]
+    for option in options[1:]:
+        if len(lines[-1]) + len(option) + 3 > TEXT_WIDTH:
+            lines.append(f"        {option}")
+        else:
+            lines[-1] += f" {option}"
+    return " \\\n".join(lines)
 
 
 def write_section(path: Path, name: str, text: str) -> None:

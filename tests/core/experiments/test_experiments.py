@@ -55,6 +55,7 @@ def test_arms_are_trained_once_and_written_between_markers(
     assert run(folder, "effect", "recurrence", "--seeds", "2") == 0
     text = results.read_text()
     assert text.startswith("# Results\n\nKept.\n")
+    assert max(map(len, text.splitlines())) <= 110
     for row in ("ramp", "constant", "base", "ema", "frozen", "**DyFN**", "**ConvGRU**", "**GRU**"):
         assert f"| {row} |" in text
     dyfn = next(line for line in text.splitlines() if line.startswith("| **DyFN** |"))
