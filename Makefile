@@ -1,4 +1,4 @@
-# make setup | demo | test | bench | lint        (see README.md)
+# make setup | demo | test | test-fast | lint | coverage | bench        (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,11 +6,11 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test lint bench clean
+.PHONY: setup demo test test-fast coverage lint bench clean
 
 setup: $(READY)
 
-$(READY): setup.py
+$(READY): pyproject.toml setup.py setup.cfg
 	$(PYTHON) -c 'import sys; v = sys.version_info; ok = (3, 10) <= v[:2] <= (3, 13); sys.exit(0 if ok else "Python 3.10 to 3.13 is needed, this is %d.%d; name one with PYTHON=python3.x" % v[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet "$(TORCH)"
@@ -22,6 +22,12 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest
+
+test-fast: $(READY)
+	$(BIN)/python -m pytest -m "not slow"
+
+coverage: $(READY)
+	$(BIN)/python -m pytest --cov --cov-report=term
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,44 @@ THREADS = torch.get_num_threads()
 ROOT = Path(__file__).resolve().parents[1]
 # Processes that tests start find the packages, and tests.support, as this process does.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+GOLDEN = ROOT / "tests" / "golden"
+# Marker -> the folders and the fixtures whose tests carry it; pyproject.toml says what it means.
+ROS_FOLDERS = ("tests/ros/node", "tests/ros/demo", "tests/ros/online_offline")
+MARKED_FIXTURES = {"gl": {"renderer"}, "golden": {"shared_dir", "golden_file"}}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks that follow from where a test is and what it asks for, so that nobody forgets one."""
+    folders = [ROOT / folder for folder in ROS_FOLDERS]
+    for item in items:
+        if any(folder in item.path.parents for folder in folders):
+            item.add_marker("ros")
+        for marker, fixtures in MARKED_FIXTURES.items():
+            if fixtures.intersection(getattr(item, "fixturenames", ())):
+                item.add_marker(marker)
 
 
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
-    """The folder of golden files and real recordings, which not every machine has."""
+    """The folder of large golden files and real recordings, which not every machine has."""
     default = ROOT.parent / "shared"
     path = Path(os.environ.get("DYFN_SHARED", default))
     if not path.is_dir():
         pytest.skip(f"{path} is absent: set DYFN_SHARED to the folder of golden files")
     return path
+
+
+@pytest.fixture(scope="session")
+def golden_file(request: pytest.FixtureRequest) -> Callable[[str], Path]:
+    """Where a golden file is: in the repository, or else among the large ones of shared_dir."""
+
+    def find(name: str) -> Path:
+        if (GOLDEN / name).exists():
+            return GOLDEN / name
+        shared: Path = request.getfixturevalue("shared_dir")
+        return shared / "golden" / name
+
+    return find
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from dyfn_core.scoring.protocols import (
 )
 
 CLIPS = {"scannet": ("a", 10), "KITTI": ("b", 80), "sintel": ("c", 70), "bonn": ("d", 10)}
+GoldenFile = Callable[[str], Path]
 NAMES = {
     "abs_rel": "abs_relative_difference",
     "delta1": "delta1_acc",
@@ -41,9 +43,9 @@ NAMES = {
 class Clip:
     """One golden clip: predictions as the released model gives them, truth, what main() wrote."""
 
-    def __init__(self, shared: Path, dataset: str) -> None:
+    def __init__(self, golden_file: GoldenFile, dataset: str) -> None:
         name, self.cap = CLIPS[dataset]
-        golden = np.load(shared / "golden" / "eval_metrics.npz")
+        golden = np.load(golden_file("eval_metrics.npz"))
         self.truth = np.nan_to_num(golden[f"eval/{dataset}_{name}/in/gt_depth"][:, 0], nan=0)
         stored = torch.from_numpy(golden[f"eval/{dataset}_{name}/in/pred_depth"])[:, None]
         if stored.shape[-2:] != self.truth.shape[-2:]:  # masked pixels are infinite already here
@@ -52,7 +54,7 @@ class Clip:
             )
         self.prediction = stored[:, 0].numpy()
         self.valid = (self.truth > 1e-3) & (self.truth < self.cap)
-        report = json.loads((shared / "golden" / "eval_metrics.json").read_text())
+        report = json.loads(golden_file("eval_metrics.json").read_text())
         self.written: dict[str, float] = report["eval"][dataset]
 
     @property
@@ -92,9 +94,9 @@ def assert_equals(clip: Clip, scores: dict[str, float], suffix: str, rel: float)
 
 
 @pytest.mark.parametrize("dataset", CLIPS)
-def test_released_least_squares_is_reproduced(shared_dir: Path, dataset: str) -> None:
+def test_released_least_squares_is_reproduced(golden_file: GoldenFile, dataset: str) -> None:
     """Our metrics and our least squares give all 20 released numbers of a clip."""
-    clip = Clip(shared_dir, dataset)
+    clip = Clip(golden_file, dataset)
     fit = least_squares(clip.with_zeros[clip.valid], clip.truth[clip.valid])
     assert_equals(clip, released_scores(clip, [fit] * len(clip.truth)), "lstsq", 2e-5)
     fits = [
@@ -115,8 +117,8 @@ def exact_on_their_samples(clip: Clip) -> tuple[dict[str, float], dict[str, floa
 
 
 @pytest.mark.parametrize("dataset", ["scannet", "KITTI", "sintel"])
-def test_released_weighted_l1_is_reproduced(shared_dir: Path, dataset: str) -> None:
-    clip = Clip(shared_dir, dataset)
+def test_released_weighted_l1_is_reproduced(golden_file: GoldenFile, dataset: str) -> None:
+    clip = Clip(golden_file, dataset)
     image, video = exact_on_their_samples(clip)
     # Masked pixels end up at 1 mm and less: their inverse moves by more than the fits do.
     assert_equals(clip, image, "per_frame_aligned_searching", 7e-3)
@@ -126,9 +128,11 @@ def test_released_weighted_l1_is_reproduced(shared_dir: Path, dataset: str) -> N
             assert scores[name] == pytest.approx(clip.written[f"{NAMES[name]}_{suffix}"], rel=5e-4)
 
 
-def test_released_l1_of_float64_truth_is_not_the_minimum_and_ours_is(shared_dir: Path) -> None:
+def test_released_l1_of_float64_truth_is_not_the_minimum_and_ours_is(
+    golden_file: GoldenFile,
+) -> None:
     """The same samples, the same masked zeros: AbsRel per frame 0.1412 released, 0.1195 exact."""
-    clip = Clip(shared_dir, "bonn")
+    clip = Clip(golden_file, "bonn")
     assert clip.truth.dtype == np.float64
     image, video = exact_on_their_samples(clip)
     released = clip.written["abs_relative_difference_per_frame_aligned_searching"]
@@ -156,13 +160,13 @@ def ours(clip: Clip, fit: str) -> dict[str, Any]:
     ],
 )
 def test_masked_predictions_as_depth_zero_is_the_released_fault_and_ours_leaves_them_out(
-    shared_dir: Path, dataset: str, released: float, right: float
+    golden_file: GoldenFile, dataset: str, released: float, right: float
 ) -> None:
     """AbsRel of the video protocol, least squares: the released number, and ours beside it.
 
     The released code keeps pixels that the model masked out, as depth 0, in fit and score.
     """
-    clip = Clip(shared_dir, dataset)
+    clip = Clip(golden_file, dataset)
     assert clip.written["abs_relative_difference_lstsq"] == pytest.approx(released, abs=6e-5)
     found = ours(clip, LEAST_SQUARES)
     assert found["video"]["abs_rel"] == pytest.approx(right, abs=6e-5)
@@ -170,9 +174,9 @@ def test_masked_predictions_as_depth_zero_is_the_released_fault_and_ours_leaves_
 
 
 @pytest.mark.parametrize("dataset", CLIPS)
-def test_without_masked_predictions_both_agree(shared_dir: Path, dataset: str) -> None:
+def test_without_masked_predictions_both_agree(golden_file: GoldenFile, dataset: str) -> None:
     """Truth taken away where the model said nothing, the released way and ours are one."""
-    clip = Clip(shared_dir, dataset)
+    clip = Clip(golden_file, dataset)
     clip.valid &= np.isfinite(clip.prediction)
     clip.truth = np.where(clip.valid, clip.truth, 0)
     fit = least_squares(clip.with_zeros[clip.valid], clip.truth[clip.valid])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -194,8 +195,10 @@ def test_batch_of_two_streams_matches(
         assert_depth(prediction.depth, want, 4, LOOSE_SHIFT)
 
 
-def test_plain_moge_matches(base: GeometryModel, shared_dir: Path, frames: np.ndarray) -> None:
-    golden = np.load(shared_dir / "golden" / "C_320x240_frame0.npz")
+def test_plain_moge_matches(
+    base: GeometryModel, golden_file: Callable[[str], Path], frames: np.ndarray
+) -> None:
+    golden = np.load(golden_file("C_320x240_frame0.npz"))
     frame = frames[golden["frame_index"][0]]
     prediction = base.infer(frame, num_tokens=TOKENS)
     name = "tok300.infer_fovNone_projTrue"

@@ -1,5 +1,6 @@
 """Depth metrics, by hand and against the released implementation."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -67,8 +68,8 @@ def test_mean_over_no_frames_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("case", ["rep0", "rep1"])
-def test_matches_the_released_metrics(shared_dir: Path, case: str) -> None:
-    golden = np.load(shared_dir / "golden" / "eval_metrics.npz")
+def test_matches_the_released_metrics(golden_file: Callable[[str], Path], case: str) -> None:
+    golden = np.load(golden_file("eval_metrics.npz"))
     output, target, mask = (golden[f"metric/{case}/in/{n}"] for n in ("output", "target", "mask"))
     size = output.shape[-2:]
     frames = [a.reshape(-1, *size) for a in (output, target, mask)]

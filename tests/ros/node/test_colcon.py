@@ -16,9 +16,9 @@ from dyfn_core.models.mini import MiniConfig, MiniModel
 from tests.support.ros_graph import Client, NodeProcess, frames, own_domain
 
 ROOT = Path(__file__).parents[3]
-TESTS = ("tests/ros/test_encodings.py", "tests/ros/test_compressed_depth.py")
+TESTS = ("test_encodings.py", "test_compressed_depth.py")
 PARTS = ("dyfn_core", "dyfn_ros", "resource", "launch", "config")
-FILES = ("package.xml", "setup.py", "setup.cfg", "LICENSE", "README.md")
+FILES = ("package.xml", "pyproject.toml", "setup.py", "setup.cfg", "LICENSE", "README.md")
 
 
 @pytest.fixture(scope="module")
@@ -30,12 +30,11 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
     heavy = shutil.ignore_patterns("__pycache__", "*.safetensors")
     for name in PARTS:
         shutil.copytree(ROOT / name, source / name, ignore=heavy)
+    (source / "tests").mkdir()
     for name in TESTS:
-        (source / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, source / name)
+        shutil.copy(ROOT / "tests/ros/messages" / name, source / "tests" / name)
     for name in FILES:
-        if (ROOT / name).exists():
-            shutil.copy(ROOT / name, source / name)
+        shutil.copy(ROOT / name, source / name)
     command = [sys.executable, "-m", "colcon", "build", "--executor", "sequential"]
     built = subprocess.run(command, cwd=workspace, capture_output=True, text=True)
     assert built.returncode == 0, built.stdout + built.stderr

@@ -1,0 +1,57 @@
+"""What pyproject.toml promises: one version, types, and commands that exist."""
+
+from __future__ import annotations
+
+import ast
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("dyfn_core", "dyfn_ros", "dyfn_worlds")
+
+
+@pytest.fixture(scope="module")
+def project() -> dict[str, Any]:
+    toml = pytest.importorskip("tomllib", reason="Python 3.11 reads TOML")
+    return toml.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def test_ros_and_python_packages_have_one_version(project: dict[str, Any]) -> None:
+    manifest = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert manifest.findtext("version") == project["project"]["version"]
+    assert manifest.findtext("name") == project["project"]["name"]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_ships_its_types(project: dict[str, Any], package: str) -> None:
+    assert (ROOT / package / "py.typed").is_file()
+    assert "py.typed" in project["tool"]["setuptools"]["package-data"][package]
+
+
+def test_package_data_are_there(project: dict[str, Any]) -> None:
+    for package, patterns in project["tool"]["setuptools"]["package-data"].items():
+        for pattern in patterns:
+            assert any((ROOT / package).glob(pattern)), f"{package}/{pattern}"
+
+
+def test_every_command_has_its_function(project: dict[str, Any]) -> None:
+    scripts = project["project"]["scripts"]
+    assert len(scripts) == 7
+    for command, place in scripts.items():
+        module, function = place.split(":")
+        spec = find_spec(module)
+        assert spec is not None and spec.origin is not None, command
+        tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+        names = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        assert function in names, command
+
+
+def test_extras_name_extras_that_exist(project: dict[str, Any]) -> None:
+    extras = project["project"]["optional-dependencies"]
+    (everything,) = extras["all"]
+    named = everything.removeprefix("dyfn_ros[").removesuffix("]").split(",")
+    assert {*named, "test", "all"} == set(extras)  # `dev` has `test`
