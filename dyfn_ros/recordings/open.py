@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.references import parse_pose
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.frames import Notes, RecordedFrame, Recording
-from dyfn_ros.recordings.rgbd_folder import (
-    IMAGE_SUFFIXES,
-    is_rgbd_folder,
-    numbered,
-    read_rgbd_folder,
-)
+from dyfn_ros.recordings.frames import RecordedFrame, Recording
+from dyfn_ros.recordings.rgbd_folder import RgbdRecording, is_rgbd_folder
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.ros import BagRecording
-from dyfn_ros.recordings.storage.base import Recorded
 from dyfn_ros.recordings.storage.open import open_storage
-from dyfn_ros.recordings.topics import Topics, choose_topics
+from dyfn_ros.recordings.topics import choose_topics
 from dyfn_ros.recordings.topics import image_topics as list_image_topics
-from dyfn_ros.recordings.typestore import (
-    CAMERA_INFO,
-    IMAGE,
-    POINT_CLOUD,
-    TYPES,
-    camera_info,
-    image_message,
-)
+from dyfn_ros.recordings.typestore import POINT_CLOUD
 from dyfn_ros.recordings.writer import RecordingWriter
 
 __all__ = [
@@ -101,50 +87,3 @@ def image_topics(path: str | Path) -> list[str | None]:
     if path.is_dir() and is_rgbd_folder(path):
         return [None]
     return [*list_image_topics(path, open_storage(path))]
-
-
-class RgbdRecording:
-    """Frames of an RGB-D folder, as if they had been recorded at a fixed rate."""
-
-    topics = Topics("rgb/", "K.txt", "depth/")
-
-    def __init__(self, path: Path, rate: float = 10.0) -> None:
-        self.path = path
-        self.notes = Notes()
-        self._rate = rate
-
-    @property
-    def expected_frames(self) -> int:
-        """See Recording."""
-        return len(numbered(self.path / "rgb", IMAGE_SUFFIXES))
-
-    def frames(self) -> Iterator[RecordedFrame]:
-        """See Recording."""
-        frame_id = "camera_optical"
-        self.notes = Notes()
-
-        def lose(reason: str) -> None:
-            self.notes.losses[reason] += 1
-
-        for index, frame in enumerate(read_rgbd_folder(self.path, self._rate, lose)):
-            stamp_ns = round(frame.stamp * 1e9)
-            image = image_message(frame.image, "rgb8", stamp_ns, frame_id)
-            info = None
-            if frame.camera_matrix is not None:
-                size = frame.image.shape[:2]
-                message = camera_info(frame.camera_matrix, size, stamp_ns, frame_id)
-                info = _made("/camera/camera_info", CAMERA_INFO, message, stamp_ns)
-            yield RecordedFrame(
-                index=index,
-                stamp_ns=stamp_ns,
-                frame_id=frame_id,
-                image=frame.image,
-                camera_matrix=frame.camera_matrix,
-                depth=frame.depth_m,
-                source=_made("/camera/image", IMAGE, image, stamp_ns),
-                info=info,
-            )
-
-
-def _made(topic: str, kind: str, message: Any, stamp_ns: int) -> Recorded:
-    return Recorded(topic, kind, stamp_ns, bytes(TYPES.serialize_cdr(message, kind)))

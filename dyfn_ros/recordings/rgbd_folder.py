@@ -5,12 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
 from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
+from dyfn_ros.recordings.storage.base import Recorded
+from dyfn_ros.recordings.topics import Topics
+from dyfn_ros.recordings.typestore import CAMERA_INFO, IMAGE, TYPES, camera_info, image_message
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
 
@@ -100,3 +105,50 @@ def _depth(file: Path) -> np.ndarray | None:
         raise RecordingError(f"{file}: expected a 16-bit one-channel PNG in mm, found {found}")
     metres = pixels.astype(np.float32) / 1000
     return np.where(pixels > 0, metres, np.float32(np.nan))
+
+
+class RgbdRecording:
+    """Frames of an RGB-D folder, as if they had been recorded at a fixed rate."""
+
+    topics = Topics("rgb/", "K.txt", "depth/")
+
+    def __init__(self, path: Path, rate: float = 10.0) -> None:
+        self.path = path
+        self.notes = Notes()
+        self._rate = rate
+
+    @property
+    def expected_frames(self) -> int:
+        """See Recording."""
+        return len(numbered(self.path / "rgb", IMAGE_SUFFIXES))
+
+    def frames(self) -> Iterator[RecordedFrame]:
+        """See Recording."""
+        frame_id = "camera_optical"
+        self.notes = Notes()
+
+        def lose(reason: str) -> None:
+            self.notes.losses[reason] += 1
+
+        for index, frame in enumerate(read_rgbd_folder(self.path, self._rate, lose)):
+            stamp_ns = round(frame.stamp * 1e9)
+            image = image_message(frame.image, "rgb8", stamp_ns, frame_id)
+            info = None
+            if frame.camera_matrix is not None:
+                size = frame.image.shape[:2]
+                message = camera_info(frame.camera_matrix, size, stamp_ns, frame_id)
+                info = _made("/camera/camera_info", CAMERA_INFO, message, stamp_ns)
+            yield RecordedFrame(
+                index=index,
+                stamp_ns=stamp_ns,
+                frame_id=frame_id,
+                image=frame.image,
+                camera_matrix=frame.camera_matrix,
+                depth=frame.depth_m,
+                source=_made("/camera/image", IMAGE, image, stamp_ns),
+                info=info,
+            )
+
+
+def _made(topic: str, kind: str, message: Any, stamp_ns: int) -> Recorded:
+    return Recorded(topic, kind, stamp_ns, bytes(TYPES.serialize_cdr(message, kind)))
