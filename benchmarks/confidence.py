@@ -21,6 +21,7 @@ import torch
 
 from dyfn_core import DepthStream, load_model
 from dyfn_core.geometry.edges import flying_pixels
+from dyfn_core.models.base import image_to_batch
 from dyfn_ros.recordings.open import RecordedFrame, open_recording
 
 
@@ -92,7 +93,7 @@ def measure(recording: Path, name: str, count: int) -> dict[str, list[tuple[floa
         stream = stream or DepthStream(model, camera_matrix=frame.camera_matrix)
         state = stream.memory.state
         prediction = stream.push(frame.image)
-        batch = torch.from_numpy(frame.image).permute(2, 0, 1)[None].float() / 255
+        batch, _ = image_to_batch(frame.image)
         with torch.inference_mode():
             affine, _ = model.predict_affine(batch, state, None, True)
         depth = prediction.depth.numpy().astype(np.float64)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
+from dyfn_core.evaluation.variants import EncodedSequence, errors_by_length
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
 from dyfn_core.experiments.report import (
     grid_table,
@@ -20,7 +21,6 @@ from dyfn_core.experiments.report import (
     write_section,
 )
 from dyfn_core.experiments.runner import Plan, Runner, encode_all
-from dyfn_core.experiments.scenes import Scene, predictions, scores_by_length
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.controls import ema_control, frozen_control
@@ -125,15 +125,12 @@ def _lengths(experiment: Experiment, runner: Runner, lengths: Sequence[int]) -> 
 
 def _curve(
     model: GeometryModel,
-    scenes: Sequence[Scene],
+    sequences: Sequence[EncodedSequence],
     stabilizer: DyFN | None,
     lengths: Sequence[int],
 ) -> dict[int, float]:
-    """Number of frames -> mean over the scenes that have so many."""
-    curves = [
-        scores_by_length(scene, predictions(model, scene, stabilizer), lengths, model.quantity)
-        for scene in scenes
-    ]
+    """Number of frames -> mean over the sequences that have so many."""
+    curves = [errors_by_length(model, s, stabilizer, lengths) for s in sequences]
     reached = sorted({length for curve in curves for length in curve})
     return {n: float(np.mean([c[n] for c in curves if n in c])) for n in reached}
 

@@ -20,7 +20,7 @@ from dyfn_core.evaluation.empirical_study import (
     write_grid,
 )
 from dyfn_core.evaluation.report.html import text_table
-from dyfn_core.models.base import GeometryModel, Latent
+from dyfn_core.models.base import GeometryModel, Latent, image_to_batch
 from dyfn_core.models.checkpoints import load_model
 
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
@@ -79,5 +79,4 @@ def _latents(
         except FrameError as error:
             lost.append(str(error))
             continue
-        pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
-        yield model.encode(pixels.to(model.device).float() / 255, num_tokens)
+        yield model.encode(image_to_batch(image, model.device)[0], num_tokens)

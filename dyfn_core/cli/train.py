@@ -15,8 +15,9 @@ import yaml
 from dyfn_core.cli import experiments
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
-from dyfn_core.evaluation.variants import VariantScore, score_variants, variant_table
+from dyfn_core.evaluation.variants import score_variants, variant_table
 from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.scoring.variants import VariantScore
 from dyfn_core.training.average import average
 from dyfn_core.training.config import (
     BaseRunConfig,

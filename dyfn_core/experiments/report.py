@@ -12,10 +12,10 @@ import numpy as np
 
 from dyfn_core.evaluation.empirical_study import StatisticsGrid, grid_ranges
 from dyfn_core.evaluation.report.html import format_cell
-from dyfn_core.evaluation.variants import VariantScore, gap_closed
+from dyfn_core.evaluation.variants import BASE_ROWS, gap_closed
 from dyfn_core.experiments.declared import Experiment
 from dyfn_core.experiments.runner import ArmScores
-from dyfn_core.experiments.scenes import BASE_ROWS
+from dyfn_core.scoring.variants import VariantScore
 
 HEADING = "## Experiments"
 METRICS = ("image_abs_rel", "video_abs_rel", "video_delta1")

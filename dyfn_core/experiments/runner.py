@@ -10,14 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from dyfn_core.data.clips import find_sequences
-from dyfn_core.data.frames import FrameSequence
-from dyfn_core.data.sequences import folder_frames
-from dyfn_core.evaluation.variants import VariantScore
+from dyfn_core.data.sequences import clip_frames, folder_frames
+from dyfn_core.evaluation.variants import (
+    EncodedSequence,
+    encode_sequence,
+    score_controls,
+    score_stabilizer,
+)
 from dyfn_core.experiments.declared import Arm
-from dyfn_core.experiments.scenes import Scene, encode_scene, score_controls, score_stabilizer
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFNConfig
+from dyfn_core.scoring.variants import VariantScore
 from dyfn_core.training.config import StabilizerRunConfig, read_config
 from dyfn_core.training.loop.checkpoint import has_state
 from dyfn_core.training.loop.processes import Processes
@@ -72,9 +76,9 @@ class Runner:
         self.config = self._settings(Arm(""), 0)
         self.model = load_model(self.config.base)
         self.model.stabilizer = None
-        self._scenes: dict[str, list[Scene]] = {}
+        self._scenes: dict[str, list[EncodedSequence]] = {}
 
-    def scenes(self) -> dict[str, list[Scene]]:
+    def scenes(self) -> dict[str, list[EncodedSequence]]:
         """Data set -> its encoded sequences."""
         if not self._scenes:
             self._scenes = encode_all(self.model, self.config, self.plan, self.plan.stride)
@@ -153,12 +157,12 @@ class Runner:
 
 def encode_all(
     model: GeometryModel, config: StabilizerRunConfig, plan: Plan, stride: int
-) -> dict[str, list[Scene]]:
+) -> dict[str, list[EncodedSequence]]:
     """The plan's recordings, and held-out clips of the config's data, by data set.
 
     Raises FileNotFoundError when there is neither.
     """
-    found: dict[str, list[Scene]] = {}
+    found: dict[str, list[EncodedSequence]] = {}
     source = clip_source(config, 2, (1, 1))
     try:
         sequences = find_sequences(source, "held_out").sequences[: plan.clips]
@@ -169,17 +173,12 @@ def encode_all(
         sequences = []
     if sequences:
         found[HELD_OUT] = [
-            encode_scene(model, sequence.name, _frames(sequence, stride)) for sequence in sequences
+            encode_sequence(model, sequence.name, clip_frames(sequence, stride))
+            for sequence in sequences
         ]
     for folder in plan.recordings:
-        found[folder.name] = [encode_scene(model, folder.name, folder_frames(folder, stride))]
+        found[folder.name] = [encode_sequence(model, folder.name, folder_frames(folder, stride))]
     return found
-
-
-def _frames(sequence: FrameSequence, stride: int) -> Any:
-    for index in range(0, len(sequence), stride):
-        frame = sequence.read(index)
-        yield frame.image, frame.depth
 
 
 def _digest(config: StabilizerRunConfig) -> str:

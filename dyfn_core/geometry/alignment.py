@@ -12,15 +12,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyfn_core.geometry.l1_fit import fit_scale_shift
-
 __all__ = [
     "align_points",
     "align_points_exact",
     "align_points_shift",
     "align_scale",
     "align_scale_shift",
-    "fit_scale_shift",
     "truncated_error",
 ]
 

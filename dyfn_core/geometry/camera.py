@@ -63,19 +63,6 @@ def check_camera_matrix(camera_matrix: np.ndarray) -> np.ndarray:
     return k
 
 
-def fov_from_intrinsics(intrinsics: np.ndarray | Tensor) -> tuple[float, float]:
-    """Normalised intrinsics 3 x 3 -> (horizontal, vertical) field of view in degrees.
-
-    Exact for an off-centre principal point: the angle between the outermost rays.
-    """
-    k = np.asarray(intrinsics, dtype=np.float64)
-
-    def angle(focal: float, centre: float) -> float:
-        return math.degrees(math.atan((1 - centre) / focal) + math.atan(centre / focal))
-
-    return angle(k[0, 0], k[0, 2]), angle(k[1, 1], k[1, 2])
-
-
 def focal_from_fov(fov_x: float | Tensor, aspect: float, batch: int) -> Tensor:
     """Horizontal field of view in degrees -> focal relative to half the diagonal, B float64.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 
 FEWEST = 16  # valid samples of a clip, as of a frame in evaluation
 

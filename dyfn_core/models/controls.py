@@ -8,11 +8,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.dyfn import EPSILON, DyFN, DyFNConfig
+from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
+from dyfn_core.models.dyfn import EMA_ALPHA, EPSILON, DyFN, DyFNConfig
 from dyfn_core.prediction import StreamState
-
-EMA_ALPHA = 0.1
 
 
 class StatisticsControl(DyFN):
@@ -67,3 +65,22 @@ def stabilized_by(model: GeometryModel, stabilizer: DyFN | None) -> Iterator[Geo
         yield model
     finally:
         model.stabilizer = own
+
+
+def decode_with(
+    model: GeometryModel, stabilizer: DyFN | None, latent: Latent, state: StreamState | None
+) -> tuple[AffinePoints | AffineDisparity, StreamState | None]:
+    """Decode a latent as if the model had this stabilizer.
+
+    Args:
+        model: encoder and decoder; its own stabilizer is not used.
+        stabilizer: what changes the latent; None decodes it as it is.
+        latent: of one frame.
+        state: of this stabilizer after the frame before; None starts a stream.
+
+    Returns:
+        The decoder's output, up to scale and shift, and the state after this frame.
+    """
+    with stabilized_by(model, stabilizer):
+        changed, state = model.stabilize_latent(latent, state)
+    return model.decode(changed), state

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 from dyfn_core.prediction import DEPTH, DISPARITY
 from dyfn_core.scoring.frame_scores import FrameScore, FrameScores, MetricRows
 from dyfn_core.scoring.metrics import depth_metrics

@@ -16,9 +16,9 @@ from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
 from dyfn_core.evaluation.benchmarks.run import (
     Note,
     Scoring,
-    VariantScorers,
     mean_of,
     plain_settings,
+    variant_scorers,
     versions,
 )
 from dyfn_core.evaluation.report.html import Cell, Table
@@ -42,7 +42,7 @@ def length_curve(
     Lengths that the sequence does not reach are left out. Memory is that of Scoring.max_samples
     per variant, whatever the length. Raises FrameError or DataError, naming file or sequence.
     """
-    scorers = VariantScorers(method, depth_max, scoring)
+    scorers = variant_scorers(method, depth_max, scoring)
     predict = method.open(sequence)
     curve: dict[int, dict[str, Point]] = {}
     for count, frame in enumerate(sequence.frames(), start=1):

@@ -11,8 +11,8 @@ import torch
 
 from dyfn_core.evaluation.benchmarks.predictions import Predict
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.controls import latent_controls, stabilized_by
+from dyfn_core.models.base import GeometryModel, image_to_batch
+from dyfn_core.models.controls import decode_with, latent_controls, stabilized_by
 from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DISPARITY, Prediction
 from dyfn_core.stream.depth_stream import DepthStream
@@ -74,17 +74,16 @@ class ModelMethod:
             if not streams:
                 streams.update(self._streams(frame))
             start = time.perf_counter()
-            image = torch.from_numpy(np.ascontiguousarray(frame.image)).permute(2, 0, 1)[None]
-            latent = self.model.encode(image.to(self.model.device).float() / 255, self.num_tokens)
+            image, _ = image_to_batch(frame.image, self.model.device)
+            latent = self.model.encode(image, self.num_tokens)
             if self.model.device.type == "cuda":
                 torch.cuda.synchronize(self.model.device)  # or the first variant would wait for it
             encoding = time.perf_counter() - start
             found = {}
             for name, stream in streams.items():
                 start = time.perf_counter()
-                with stabilized_by(self.model, self._stabilizers[name]):
-                    changed, state = self.model.stabilize_latent(latent, stream.memory.state)
-                affine = self.model.decode(changed)
+                stabilizer, state = self._stabilizers[name], stream.memory.state
+                affine, state = decode_with(self.model, stabilizer, latent, state)
                 found[name] = as_array(stream.finish(affine, state, float(index)))
                 self._seconds[name].append(encoding + time.perf_counter() - start)
             return found

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -15,16 +16,8 @@ from dyfn_core.evaluation.benchmarks.pictures import BenchmarkPictures, Sequence
 from dyfn_core.evaluation.benchmarks.predictions import Method, Predict
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
 from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
-from dyfn_core.prediction import DEPTH
-from dyfn_core.scoring.protocols import (
-    CONTROLS,
-    L1,
-    SequenceScore,
-    SequenceScorer,
-    predicted,
-    spread,
-    to_shape,
-)
+from dyfn_core.scoring.protocols import CONTROLS, L1, SequenceScore, SequenceScorer, spread
+from dyfn_core.scoring.variants import VariantScorers
 
 PROTOCOLS = ("image", "video", "metric")
 PACKAGES = ("dyfn_ros", "numpy", "torch", "opencv-python-headless")
@@ -47,33 +40,11 @@ class Scoring:
         )
 
 
-class VariantScorers:
-    """The scorers of a sequence: one per variant of the method and one per control."""
-
-    def __init__(self, method: Method, depth_max: float, scoring: Scoring) -> None:
-        self.method = method
-        self.scorers = {v: scoring.scorer(depth_max, method.quantity) for v in method.variants}
-        self.scorers |= {f"control: {c}": scoring.scorer(depth_max, DEPTH) for c in CONTROLS}
-
-    @property
-    def first(self) -> SequenceScorer:
-        """Of the method's first variant, which the pictures are of."""
-        return self.scorers[self.method.variants[0]]
-
-    def push(self, found: Mapping[str, np.ndarray], truth: np.ndarray) -> dict[str, np.ndarray]:
-        """One frame's predictions by variant; returns all maps that were scored, at truth's size.
-
-        The controls are scored where the method's first variant says something.
-        Raises ValueError when a prediction has another aspect ratio than truth.
-        """
-        maps = {name: to_shape(found[name], truth.shape) for name in self.method.variants}
-        valid = predicted(maps[self.method.variants[0]], self.method.quantity)
-        for name, control in CONTROLS.items():
-            values = control((truth.shape[0], truth.shape[1]))
-            maps[f"control: {name}"] = np.where(valid, values, np.float32(np.nan))
-        for name, values in maps.items():
-            self.scorers[name].push(values, truth)
-        return maps
+def variant_scorers(method: Method, depth_max: float, scoring: Scoring) -> VariantScorers:
+    """Empty scorers of a method's variants, and of the controls beside them."""
+    scorer = partial(scoring.scorer, depth_max)
+    controls = {name: f"control: {name}" for name in CONTROLS}
+    return VariantScorers(method.variants, method.quantity, scorer, controls)
 
 
 def score_sequence(
@@ -87,7 +58,7 @@ def score_sequence(
 
     Raises FrameError or DataError, naming the file or sequence and what was expected.
     """
-    scorers = VariantScorers(method, depth_max, scoring)
+    scorers = variant_scorers(method, depth_max, scoring)
     taken = None if pictures is None else pictures.begin(sequence)
     with TemporalScorer() as temporal:
         steady = temporal if scoring.temporal else None
@@ -139,7 +110,7 @@ def _push_all(
         if temporal is not None:
             temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
         if taken is not None:
-            said = maps[scorers.method.variants[0]]
+            said = maps[scorers.variants[0]]
             taken.add(count - 1, frame.image, said, truth, scorers.first.frames[-1])
     return count
 

@@ -26,11 +26,17 @@ from dyfn_core.losses.ssi import ssi_loss
 from dyfn_core.losses.target import target_from_depth
 from dyfn_core.losses.temporal import temporal_loss, window_pairs
 from dyfn_core.losses.whole_frame import whole_frame_loss
-from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import (
+    AffineDisparity,
+    AffinePoints,
+    GeometryModel,
+    Latent,
+    image_to_batch,
+)
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
-from dyfn_core.scoring.quick import known_mean, sequence_scores
+from dyfn_core.scoring.variants import VariantScore, VariantScorers, mean_scores
 from dyfn_core.training.config import ConfigError, StabilizerRunConfig
 from dyfn_core.training.loop.processes import full_precision, part_seed, share_of
 from dyfn_core.training.tasks.base import clip_source
@@ -171,23 +177,23 @@ class StabilizerTask(Task):
     def _scores(self, kind: str) -> dict[str, float]:
         scores = {}
         for name, sequences in self.sequences.items():
-            found = [self._score(sequence, kind == "dyfn") for sequence in sequences]
-            for protocol in ("image", "video"):
-                scores[f"{name}_{kind}_{protocol}"] = known_mean(s[protocol] for s in found)
+            found = mean_scores(self._score(sequence, kind == "dyfn") for sequence in sequences)
+            scores[f"{name}_{kind}_image"] = found.image_abs_rel
+            scores[f"{name}_{kind}_video"] = found.video_abs_rel
         return scores
 
-    def _score(self, sequence: Sequence, stabilized: bool) -> dict[str, float]:
+    def _score(self, sequence: Sequence, stabilized: bool) -> VariantScore | None:
         state: StreamState | None = None
-        predicted = []
-        for features in sequence.latent:
+        scorers = VariantScorers(("dyfn",), self.model.quantity)
+        for features, depth in zip(sequence.latent, sequence.depth, strict=True):
             features = features[None].to(self.model.device).float()
             latent = Latent(features, sequence.image_size, sequence.network_size)
             if stabilized:
                 latent, state = self.model.stabilize_latent(latent, state)
             affine = self._decode(latent.features[:, None], latent.image_size, latent.network_size)
-            predicted.append(affine.values[0, 0].cpu().numpy())
-        true = [depth.float().numpy() for depth in sequence.depth]
-        return sequence_scores(predicted, true, self.model.quantity)
+            predicted = affine.values[0, 0].cpu().numpy()
+            scorers.push({"dyfn": predicted}, depth.float().numpy())
+        return scorers.scores()["dyfn"]
 
     @cached_property
     def base_scores(self) -> dict[str, float]:
@@ -229,9 +235,7 @@ class StabilizerTask(Task):
         latents, depths = [], []
         size = (0, 0)
         for example in examples:
-            image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
-            image = image.to(self.model.device).float() / 255
-            latent = self.model.encode(image)
+            latent = self.model.encode(image_to_batch(example.image, self.model.device)[0])
             size = latent.network_size
             latents.append(latent.features[0].half().cpu())
             rows = (np.arange(size[0] // 2) * 2 + 1) * example.depth.shape[0] // size[0]

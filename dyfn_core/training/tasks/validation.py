@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from dyfn_core.data.frames import FrameError, FrameSequence
-from dyfn_core.geometry.alignment import fit_scale_shift
-from dyfn_core.models.base import AffineDisparity, GeometryModel
-from dyfn_core.scoring.quick import known_mean
+from dyfn_core.models.base import GeometryModel, image_to_batch
+from dyfn_core.scoring.protocols import SequenceScorer
 
 logger = logging.getLogger(__name__)
 SHORT_SIDE = 240  # frames are shrunk to this before they are encoded
@@ -74,28 +73,18 @@ def _small(image: np.ndarray, depth: np.ndarray) -> Example:
     return Example(image, cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
 
 
+@torch.no_grad()
 def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
     """Mean AbsRel and delta1 over the examples, image protocol (paper section 5).
 
-    Examples of fewer than 100 known depths are left out; NaN without any other.
+    NaN when no example has enough known depth to be scored.
     """
-    errors, shares = [], []
+    scorer = SequenceScorer(quantity=model.quantity)
     for example in examples:
-        image = torch.from_numpy(np.ascontiguousarray(example.image)).permute(2, 0, 1)[None]
-        latent = model.encode(image.to(model.device).float() / 255)
-        affine = model.decode(latent)
-        if isinstance(affine, AffineDisparity):
-            raise TypeError("single frames of a disparity model are scored by dyfn-eval")
-        depth = affine.points[0, ..., 2].cpu().numpy()
-        valid = np.isfinite(example.depth) & (example.depth > 1e-3)
-        if valid.sum() < 100:
-            continue
-        true, ours = example.depth[valid], depth[valid]
-        scale, shift = fit_scale_shift(ours[::4], true[::4], 1 / true[::4])
-        aligned = np.maximum(scale * ours + shift, 1e-3)
-        errors.append(np.mean(np.abs(aligned - true) / true))
-        shares.append(np.mean(np.maximum(aligned / true, true / aligned) < 1.25))
-    return {"abs_rel": known_mean(errors), "delta1": known_mean(shares)}
+        affine = model.decode(model.encode(image_to_batch(example.image, model.device)[0]))
+        scorer.push(affine.values[0].float().cpu().numpy(), example.depth)
+    means = scorer.frames.metrics.means() or {}
+    return {name: means.get(name, np.nan) for name in ("abs_rel", "delta1")}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 from dyfn_core.losses.resample import nearest_valid
 from dyfn_core.scoring.metrics import depth_metrics, mean_metrics
 from dyfn_core.scoring.protocols import (

@@ -12,11 +12,11 @@ import yaml
 
 from dyfn_core.cli.train import main
 from dyfn_core.evaluation.empirical_study import change_statistics, statistics_grid
-from dyfn_core.evaluation.variants import VariantScore
 from dyfn_core.experiments.declared import EXPERIMENTS, find_experiments
 from dyfn_core.experiments.report import ArmScores, trained_table, verdicts, write_section
 from dyfn_core.models.base import Latent
 from dyfn_core.models.mini import MiniModel
+from dyfn_core.scoring.variants import VariantScore
 from dyfn_core.training.config import StabilizerRunConfig, read_config
 from tests.support.training_toys import tiny_base, tiny_stabilizer_settings
 

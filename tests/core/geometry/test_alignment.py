@@ -17,8 +17,8 @@ from dyfn_core.geometry.alignment import (
     align_points_shift,
     align_scale,
     align_scale_shift,
-    fit_scale_shift,
 )
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 
 TRUNCS = (None, 1.0, 0.2)
 

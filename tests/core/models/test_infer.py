@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from dyfn_core.geometry.camera import fov_from_intrinsics
 from dyfn_core.models.moge import MoGeModel, resized, whole_patches
 from dyfn_core.prediction import Prediction
 from tests.support.pinhole import FOV_X, PinholeModel, picture
@@ -31,11 +30,16 @@ def same(one: Prediction, other: Prediction) -> bool:
     )
 
 
+def field_of_view(prediction: Prediction) -> float:
+    """Horizontal, in degrees."""
+    return math.degrees(2 * math.atan(0.5 / prediction.intrinsics[0, 0].item()))
+
+
 def test_pinhole_scene_comes_out_as_it_is(pinhole: PinholeModel) -> None:
     image = picture(shift=0.2)
     prediction = pinhole.infer(image)
     truth = image[..., 0] / 255 + 0.5
-    assert fov_from_intrinsics(prediction.intrinsics)[0] == pytest.approx(FOV_X, abs=1e-3)
+    assert field_of_view(prediction) == pytest.approx(FOV_X, abs=1e-3)
     np.testing.assert_allclose(prediction.depth.numpy(), truth, rtol=1e-4)
     own = pinhole.infer(image, force_projection=False)
     np.testing.assert_allclose(own.points.numpy(), prediction.points.numpy(), atol=1e-4)
@@ -43,7 +47,7 @@ def test_pinhole_scene_comes_out_as_it_is(pinhole: PinholeModel) -> None:
 
 def test_known_field_of_view_is_kept(pinhole: PinholeModel) -> None:
     prediction = pinhole.infer(picture(), fov_x=50.0)
-    assert fov_from_intrinsics(prediction.intrinsics)[0] == pytest.approx(50, abs=1e-4)
+    assert field_of_view(prediction) == pytest.approx(50, abs=1e-4)
     np.testing.assert_allclose(
         prediction.intrinsics[0, 0].item() * 64, prediction.intrinsics[1, 1].item() * 48, rtol=1e-6
     )

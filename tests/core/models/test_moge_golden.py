@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from dyfn_core.models import load_model
-from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.base import GeometryModel, image_to_batch
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction
 
@@ -87,7 +87,7 @@ def test_latent_and_stabilized_latent_match_over_the_clip(
     state = None
     with torch.inference_mode():
         for index, frame in enumerate(frames):
-            image = torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
+            image, _ = image_to_batch(frame)
             latent = model.encode(image, TOKENS)
             after, state = model.stabilize_latent(latent, state)
             for got, name in (
@@ -112,7 +112,7 @@ def test_affine_points_and_mask_match(
     state = None
     with torch.inference_mode():
         for index in range(2):
-            image = torch.from_numpy(frames[index]).permute(2, 0, 1)[None].float() / 255
+            image, _ = image_to_batch(frames[index])
             affine, state = model.predict_affine(image, state, TOKENS)
             points = affine.points[0, ::4, ::4].numpy()
             want = golden["points_remapped"][index]

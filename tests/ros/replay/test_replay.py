@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from dyfn_core.evaluation.benchmarks.model_method import as_array
-from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 from dyfn_core.models.controls import latent_controls, stabilized_by
 from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.stream.depth_stream import DepthStream
