@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.data.datasets import DataKind
-from dyfn_core.data.datasets.files import read_colour, read_float16_png, registered, rgbd_frame
+from dyfn_core.data.files import read_colour, read_float16_png, registered, rgbd_frame
 from dyfn_core.data.frames import (
     DataError,
     DataReport,

@@ -25,7 +25,7 @@ from dyfn_core.data.datasets import (
     spring,
     tartanair,
 )
-from dyfn_core.data.datasets.files import nothing_found
+from dyfn_core.data.files import nothing_found
 from dyfn_core.data.frames import DataError, DataReport, FrameSequence
 
 ENTRY_POINTS = "dyfn_core.data_kinds"

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.data.datasets.axes import pytorch3d_pose
-from dyfn_core.data.datasets.files import read_colour, read_float16_png, rgbd_frame
+from dyfn_core.data.axes import pytorch3d_pose
+from dyfn_core.data.files import read_colour, read_float16_png, rgbd_frame
 from dyfn_core.data.frames import DataReport, FrameError, FrameSequence, RgbdFrame, uninterrupted
 
 EXPECTED = "<split>/frame_annotations_<split>.jgz and <split>/<sequence>_left/{images,depths}/"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.datasets.files import (
+from dyfn_core.data.files import (
     folders_holding,
     numbered_files,
     read_colour,

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.datasets.axes import inverse
-from dyfn_core.data.datasets.files import (
+from dyfn_core.data.axes import inverse
+from dyfn_core.data.files import (
     folders_holding,
     numbered_files,
     read_colour,

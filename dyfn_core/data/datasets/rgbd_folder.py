@@ -13,8 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from dyfn_core.data.datasets.axes import quaternion_rotation, rigid
-from dyfn_core.data.datasets.files import (
+from dyfn_core.data.axes import quaternion_rotation, rigid
+from dyfn_core.data.files import (
     folders_holding,
     numbered_files,
     read_colour,

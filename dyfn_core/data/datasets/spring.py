@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.data.datasets.axes import inverse
-from dyfn_core.data.datasets.files import (
+from dyfn_core.data.axes import inverse
+from dyfn_core.data.files import (
     folders_holding,
     needed,
     numbered_files,

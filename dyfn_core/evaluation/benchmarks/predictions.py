@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dyfn_core.data.datasets.files import read_exr, read_uint16
+from dyfn_core.data.files import read_exr, read_uint16
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.arrays import frames_of_array, npz_key
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from dyfn_core.data.datasets.files import nothing_found
+from dyfn_core.data.files import nothing_found
 from dyfn_core.data.frames import DataError, DataReport
 from dyfn_core.evaluation.benchmarks.sets import (
     bonn,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.datasets.files import folders_holding, numbered_files, read_colour, read_uint16
+from dyfn_core.data.files import folders_holding, numbered_files, read_colour, read_uint16
 from dyfn_core.data.frames import DataReport, FrameError
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from dyfn_core.data.datasets.files import folders_holding
 from dyfn_core.data.datasets.rgbd_folder import EXPECTED, Camera, open_rgbd_folder
+from dyfn_core.data.files import folders_holding
 from dyfn_core.data.frames import DataError, DataReport, FrameError, NumberedSequence
 from dyfn_core.evaluation.benchmarks.sets.base import (
     UNREADABLE,

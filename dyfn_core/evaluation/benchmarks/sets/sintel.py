@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.datasets.axes import inverse
-from dyfn_core.data.datasets.files import numbered_files, read_colour, with_depth
+from dyfn_core.data.axes import inverse
+from dyfn_core.data.files import numbered_files, read_colour, with_depth
 from dyfn_core.data.frames import DataReport, FrameError
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
 
