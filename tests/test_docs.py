@@ -18,6 +18,7 @@ PAGES = sorted(
         *ROOT.glob("*.md"),
         *(ROOT / "docs").rglob("*.md"),
         ROOT / "bags/README.md",
+        ROOT / "tests/golden/README.md",
         ROOT / "dyfn_core/weights/README.md",
     ]
 )
