@@ -18,10 +18,17 @@ HUBER = 0.3
 
 
 def canonical_scale_loss(points: Tensor, target: Target) -> Tensor:
-    """Mean over frames of the Huber loss of |mean_i log z_i - log(z*_i / focal)|.
+    """mean_j huber(mean_i (log z_i - log(z*_i / f))); not of the paper.
 
-    points: B x H x W x 3 after the remap (z > 0). focal is in units of the image's diagonal.
-    A frame without a valid pixel counts 0.
+    The focal length f is in units of the image's diagonal. The Huber loss is linear above HUBER,
+    with slope 1.
+
+    Args:
+        points: Predicted points after the remap, B x H x W x 3 with z > 0.
+        target: The true geometry of the frames.
+
+    Returns:
+        The mean over frames; one without a valid pixel counts 0.
     """
     truth = torch.where(target.valid, target.points[..., 2], 1.0)
     ratio = points[..., 2].log() - (truth / target.focal[:, None, None]).log()

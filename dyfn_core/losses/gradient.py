@@ -11,11 +11,18 @@ SCALES = 4
 
 
 def gradient_loss(points: Tensor, target: Target, scales: int = SCALES) -> Tensor:
-    """Sum over scales of the mean |d_x R| + |d_y R|, with R = log z - log z*.
+    """sum_k mean (|d_x R^k| + |d_y R^k|), R = log z - log z*; not of the paper.
 
-    points: B x H x W x 3 with z > 0. At scale k only every 2^k-th row and column counts. Pairs
-    with an invalid end count for nothing; a batch without a pair is 0. MiDaS' gradient matching
-    term (Ranftl et al. 2020, eq. 11) on log depth, where no alignment is needed.
+    MiDaS' gradient matching term (Ranftl et al. 2020, eq. 11) on log depth, where no alignment is
+    needed. R^k takes every 2^k-th row and column.
+
+    Args:
+        points: Predicted points, B x H x W x 3 with z > 0.
+        target: The true geometry of the frames.
+        scales: How many k, from 0 on.
+
+    Returns:
+        The sum of the means over pairs of valid neighbours; 0 without any.
     """
     truth = torch.where(target.valid, target.points[..., 2], 1.0)
     ratio = points[..., 2].log() - truth.log()

@@ -9,10 +9,17 @@ from torch import Tensor
 
 
 def nearest_valid(mask: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """mask B x H x W bool, size (h, w) -> flat indices into H x W and bool, both B x h * w.
+    """Find the valid pixel nearest to the centre of each cell of a grid.
 
-    A cell looks as far as it reaches, at least one pixel; the bool says whether anything valid is
-    there. The index of a cell without is somewhere inside the map.
+    A cell looks as far as it reaches, at least one pixel.
+
+    Args:
+        mask: Valid pixels, B x H x W bool.
+        size: Rows h and columns w of the grid.
+
+    Returns:
+        Flat indices into H x W, and whether the cell has a valid pixel, both B x h * w. The index
+        of a cell without one is somewhere inside the map.
     """
     height, width = mask.shape[-2:]
     rows, row_distance = _window(height, size[0], mask.device)
@@ -39,7 +46,15 @@ def _window(length: int, cells: int, device: torch.device) -> tuple[Tensor, Tens
 
 
 def pick(values: Tensor, index: Tensor) -> Tensor:
-    """values B x H x W (x D) at flat indices B x N -> B x N (x D)."""
+    """Read a map at flat indices.
+
+    Args:
+        values: B x H x W or B x H x W x D.
+        index: Flat indices into H x W, B x N.
+
+    Returns:
+        B x N or B x N x D.
+    """
     flat = values.flatten(1, 2)
     if flat.dim() == 3:
         index = index[..., None].expand(-1, -1, flat.shape[-1])

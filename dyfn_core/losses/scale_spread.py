@@ -5,15 +5,21 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dyfn_core.losses.clip_alignment import ClipTarget
+from dyfn_core.losses.target import ClipTarget
 
 
 def scale_spread_loss(points: Tensor, target: ClipTarget) -> Tensor:
-    """Mean absolute deviation of the frames' log scales from their clip's mean.
+    """mean_j |e_j - mean_j e_j|, e_j = mean_i (log z_ji - log z*_ji); not of the paper.
 
-    points: B x T x H x W x 3 with z > 0. A frame's log scale is the mean of log z_i - log z*_i over
-    its valid pixels. Unlike the alignment terms it cannot be lowered by flattening the depth.
-    Frames without a valid pixel count for nothing; a clip with fewer than two frames is 0.
+    Unlike the alignment terms it cannot be lowered by flattening the depth.
+
+    Args:
+        points: Predicted points, B x T x H x W x 3 with z > 0.
+        target: The true geometry of the clips.
+
+    Returns:
+        The mean over clips; frames without a valid pixel do not count, a clip with fewer than two
+        frames is 0.
     """
     truth = torch.where(target.valid, target.points[..., 2], 1.0)
     ratio = torch.where(target.valid, points[..., 2].log() - truth.log(), 0.0)
@@ -24,7 +30,15 @@ def scale_spread_loss(points: Tensor, target: ClipTarget) -> Tensor:
 
 
 def spread(values: Tensor, seen: Tensor) -> Tensor:
-    """Mean absolute deviation of B x T finite values from their row's mean, where seen is 1."""
+    """Mean absolute deviation from the mean of each row.
+
+    Args:
+        values: B x T, finite.
+        seen: B x T, 1 where a value counts, else 0.
+
+    Returns:
+        The mean over the rows.
+    """
     frames = seen.sum(1, keepdim=True).clamp(min=1)
     mean = (values * seen).sum(1, keepdim=True) / frames
     return (((values - mean).abs() * seen).sum(1) / frames[:, 0]).mean()

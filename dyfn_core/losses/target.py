@@ -12,9 +12,11 @@ from torch import Tensor
 class Target:
     """True points of a batch of frames.
 
-    points: B x H x W x 3 metres, optical frame; finite everywhere, meaningless where not valid.
-    valid: B x H x W bool, the depth is finite. infinite: B x H x W bool, sky.
-    focal: B, focal length in units of the image's diagonal.
+    Attributes:
+        points: B x H x W x 3 metres, optical frame; finite everywhere, meaningless where not valid.
+        valid: B x H x W bool, the depth is known and finite.
+        infinite: B x H x W bool, sky.
+        focal: B, focal length in units of the image's diagonal.
     """
 
     points: Tensor
@@ -27,10 +29,44 @@ class Target:
         return torch.where(self.valid, 1 / self.points[..., 2], 0.0)
 
 
-def target_from_depth(depth: Tensor, intrinsics: Tensor, aspect: float) -> Target:
-    """depth B x H x W metres (inf sky, NaN invalid), normalised fx, fy, cx, cy B x 4 -> Target.
+@dataclass(frozen=True)
+class ClipTarget:
+    """The true geometry of B clips of T frames.
 
-    aspect: width / height of the image.
+    Attributes:
+        frames: All frames of all clips, B * T in that order.
+        length: T.
+    """
+
+    frames: Target
+    length: int
+
+    @property
+    def valid(self) -> Tensor:
+        """B x T x H x W bool."""
+        return self.frames.valid.unflatten(0, (-1, self.length))
+
+    @property
+    def points(self) -> Tensor:
+        """B x T x H x W x 3 metres."""
+        return self.frames.points.unflatten(0, (-1, self.length))
+
+    @property
+    def weight(self) -> Tensor:
+        """B x T x H x W: 1 / z where valid, else 0."""
+        return self.frames.weight().unflatten(0, (-1, self.length))
+
+
+def target_from_depth(depth: Tensor, intrinsics: Tensor, aspect: float) -> Target:
+    """Unproject true depth.
+
+    Args:
+        depth: B x H x W metres, inf for sky, NaN where unknown.
+        intrinsics: B x 4, normalised fx, fy, cx, cy.
+        aspect: Width / height of the image.
+
+    Returns:
+        The true points of the frames.
     """
     valid = torch.isfinite(depth) & (depth > 0)
     z = torch.where(valid, depth, 1.0)

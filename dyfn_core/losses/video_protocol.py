@@ -11,12 +11,17 @@ FEWEST = 16  # valid samples of a clip, as of a frame in evaluation
 
 
 def video_protocol_loss(prediction: Tensor, truth: Tensor) -> Tensor:
-    """Mean of |s p + t - d| / d with the best s and t of each clip, averaged over the clips.
+    """min_(s, t) mean_ji |s p_ji + t - d_ji| / d_ji (paper section 5).
 
-    prediction: B x T x N, positive; truth: B x T x N metres, not finite where it is unknown. s and
-    t are the exact minimum of this same error, so no gradient has to flow through them: at a
-    minimum it is that of the error with s and t held. Clips with fewer than FEWEST known samples
-    count for nothing; without any other clip the loss is 0.
+    s and t are the exact minimum of this same error, so no gradient has to flow through them: at a
+    minimum it is that of the error with s and t held.
+
+    Args:
+        prediction: Positive depths, B x T x N.
+        truth: True depths, B x T x N metres, not finite where unknown.
+
+    Returns:
+        The mean over clips with FEWEST known samples; 0 without any.
     """
     losses = []
     for p, d in zip(prediction.flatten(1), truth.flatten(1), strict=True):

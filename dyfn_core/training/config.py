@@ -21,7 +21,7 @@ from dyfn_core.data.datasets import AUTO, RENDERED, data_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
-from dyfn_core.losses.objective import Objective
+from dyfn_core.losses.full.objective import Objective
 from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.models.mini import MiniConfig
 from dyfn_core.training.config_errors import check_fields, describe
@@ -187,7 +187,7 @@ class StabilizerRunConfig(RunConfig):
     own error. align_differentiable: gradients flow through the first frame's alignment (the
     paper detaches it). A base of disparity is trained with L_ssi and L_temp as in the paper:
     ssi_weight, temporal_weight, and disparity_align_weight for first-frame alignment in disparity
-    space. objective: fields of losses.objective.Objective; given, it replaces the terms above
+    space. objective: fields of losses.full.objective.Objective; given, it replaces the terms above
     for a base of points, and every unrolled frame is decoded. validation_stride: every
     so-many-th frame of the recording.
     """

@@ -1,4 +1,4 @@
-"""Errors inside balls around anchors, each ball with its own scale and shift (paper section 4)."""
+"""L_local: errors inside balls, each with its own scale and shift (paper section 4)."""
 
 from __future__ import annotations
 
@@ -9,77 +9,24 @@ import torch
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import align_points
-from dyfn_core.losses.resample import nearest_valid, pick
+from dyfn_core.losses.full.whole_frame import smooth
+from dyfn_core.losses.resample import nearest_valid
 from dyfn_core.losses.target import Target
-from dyfn_core.losses.whole_frame import smooth
 
-SIDE = 5  # samples along the side of the square in which a ball's points are looked for
-FEWEST = 8  # balls with fewer valid samples are dropped
-CANDIDATES = 4  # samples that the alignment may pass through
 TRUNC = 1.0
-FEWEST_IN_BALL = 32  # of ball_loss, which sees every pixel
+FEWEST = 32  # balls with fewer valid pixels are dropped
 NEIGHBOURS = 64
 SCALE_RANGE = 10.0  # a ball's scale lies within this factor of the frame's
 
 
-def local_loss(points: Tensor, target: Target, scale: Tensor, alpha: float, balls: int) -> Tensor:
-    """Mean error of `balls` random balls per frame, of radius alpha * z * diagonal / (2 f).
-
-    points: B x H x W x 3. scale: B, of the whole frames. Aligned by scale and xyz-shift.
-    """
-    height, width = target.valid.shape[1:]
-    diagonal = (height**2 + width**2) ** 0.5
-    reach = alpha * diagonal / 2
-    weight = target.weight()
-    chance = target.valid.flatten(1).float() + 1e-9
-    centre = torch.multinomial(chance, balls)
-    offsets = torch.linspace(-reach, reach, SIDE).trunc().long()
-    rows = (centre // width)[..., None, None] + offsets[:, None]
-    cols = (centre % width)[..., None, None] + offsets[None, :]
-    outside = (rows < 0) | (rows >= height) | (cols < 0) | (cols >= width)
-    index = rows.clamp(0, height - 1) * width + cols.clamp(0, width - 1)
-    index, outside = index.flatten(2), outside.flatten(2)
-    shape = index.shape
-
-    def gather(values: Tensor) -> Tensor:
-        return pick(values, index.flatten(1)).unflatten(1, shape[1:])
-
-    true, predicted, weights = gather(target.points), gather(points), gather(weight)
-    middle = SIDE * SIDE // 2
-    radius = alpha * true[:, :, middle, 2] / (2 * target.focal[:, None])
-    distance = (true - true[:, :, middle : middle + 1]).norm(dim=-1)
-    weights = weights * (~outside & (distance <= radius[..., None]))
-    counted = (weights > 0).flatten(0, 1)
-    ball_scale, ball_shift = _align(predicted, true, weights)
-    ratio = ball_scale / scale.repeat_interleave(balls).clamp(min=1e-12)
-    usable = (counted.sum(-1) >= FEWEST) & (ratio > 1 / SCALE_RANGE) & (ratio < SCALE_RANGE)
-    aligned = ball_scale[:, None, None] * predicted.flatten(0, 1) + ball_shift[:, None, :]
-    error = weights.flatten(0, 1) * (aligned - true.flatten(0, 1)).abs().sum(-1)
-    per_ball = error.sum(-1) / counted.sum(-1).clamp(min=1)
-    return torch.where(usable, per_ball, 0.0).sum() / usable.sum().clamp(min=1)
-
-
-def _align(predicted: Tensor, true: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The centre and a few random samples are the anchors."""
-    count = predicted.shape[0] * predicted.shape[1]
-    chance = weights.detach().flatten(0, 1) + 1e-12
-    anchors = torch.multinomial(chance, CANDIDATES - 1)
-    middle = torch.full((count, 1), SIDE * SIDE // 2, device=anchors.device)
-    return align_points(
-        predicted.detach().flatten(0, 1),
-        true.flatten(0, 1),
-        weights.flatten(0, 1),
-        "xyz",
-        TRUNC,
-        torch.cat([middle, anchors], dim=1),
-    )
-
-
 @dataclass(frozen=True)
 class LocalLevel:
-    """One level of MoGe's local term: balls of radius alpha * z * diagonal / (2 f).
+    """One level of L_local: balls of radius alpha z sqrt(W^2 + H^2) / (2 f) around anchors.
 
-    anchors: balls per frame. resolution: a ball is aligned on resolution x resolution samples.
+    Attributes:
+        alpha: Radius of the balls relative to what the image spans at their depth.
+        anchors: Balls per frame.
+        resolution: A ball is aligned on resolution x resolution samples.
     """
 
     alpha: float
@@ -87,26 +34,49 @@ class LocalLevel:
     resolution: int
 
 
-# The paper's text, and the released training configuration.
+# The paper's text; the released training configuration has an alpha of 1/64 in the last.
 TEXT_LEVELS = (LocalLevel(1 / 4, 16, 16), LocalLevel(1 / 16, 256, 8), LocalLevel(1 / 32, 4096, 4))
-RELEASED_LEVELS = (*TEXT_LEVELS[:2], LocalLevel(1 / 64, 4096, 4))
 
 
 def square_radius(alpha: float, size: tuple[int, int]) -> int:
-    """Half the side, in pixels, of the square in which a ball's points are looked for."""
+    """Find how far from its anchor a ball's points are looked for.
+
+    Args:
+        alpha: Radius of the ball, see LocalLevel.
+        size: Height and width of the image in pixels.
+
+    Returns:
+        Half the side of the square, in pixels.
+    """
     return math.ceil(0.5 * alpha * math.hypot(*size))
 
 
 def ball_radius(target: Target, alpha: float) -> Tensor:
-    """The ball's radius around each pixel's true point, metres: B x H x W."""
+    """alpha z sqrt(W^2 + H^2) / (2 f) around each pixel's true point (paper section 4).
+
+    Args:
+        target: The true geometry of the frames.
+        alpha: See LocalLevel.
+
+    Returns:
+        The radius, B x H x W metres.
+    """
     return 0.5 * alpha * target.points[..., 2] / target.focal[:, None, None]
 
 
 def anchor_chance(target: Target, alpha: float, offsets: Tensor | None = None) -> Tensor:
-    """How likely each pixel becomes an anchor, B x H x W: more so with few neighbours in its ball.
+    """Find how likely each pixel becomes an anchor: more so with few neighbours in its ball.
 
-    Balances fine structures against walls. offsets: 2 x H x W x N row and column offsets of the
-    neighbours that are looked at; None draws 64 a pixel with torch's generator.
+    Balances fine structures against walls.
+
+    Args:
+        target: The true geometry of the frames.
+        alpha: See LocalLevel.
+        offsets: Row and column offsets of the neighbours that are looked at, 2 x H x W x N; None
+            draws NEIGHBOURS a pixel with torch's generator.
+
+    Returns:
+        Chances, B x H x W; they add up to 1 in frames with a valid pixel.
     """
     height, width = target.valid.shape[-2:]
     if offsets is None:
@@ -126,7 +96,16 @@ def anchor_chance(target: Target, alpha: float, offsets: Tensor | None = None) -
 
 
 def draw_anchors(target: Target, level: LocalLevel, chance: Tensor | None = None) -> Tensor:
-    """Flat pixel indices B x level.anchors, drawn with replacement; -1 in frames without truth."""
+    """Draw anchors with replacement.
+
+    Args:
+        target: The true geometry of the frames.
+        level: Size and number of the balls.
+        chance: As anchor_chance gives it; None for what it gives.
+
+    Returns:
+        Flat pixel indices, B x level.anchors; -1 in frames without a valid pixel.
+    """
     if chance is None:
         chance = anchor_chance(target, level.alpha)
     empty = ~target.valid.flatten(1).any(1)
@@ -135,22 +114,33 @@ def draw_anchors(target: Target, level: LocalLevel, chance: Tensor | None = None
     return torch.where(empty[:, None], -1, drawn)
 
 
-def ball_loss(
+def local_loss(
     points: Tensor,
     target: Target,
+    scale: Tensor | None,
     level: LocalLevel,
-    scale: Tensor | None = None,
     anchors: Tensor | None = None,
     beta: float = 0.0,
 ) -> Tensor:
-    """MoGe's local term at full resolution: B, the sum of the balls' errors over level.anchors.
+    """L_local = sum_a mean_i (1 / z*_i) |s_a p_i + t_a - p*_i|_1 / anchors (paper section 4; MoGe).
 
-    A ball holds every valid pixel of the square around its anchor whose true point is within its
-    radius; those of fewer than FEWEST_IN_BALL pixels are dropped. Each is aligned by scale and
-    xyz-shift (detached), its error is |s p + t - p*| / z* averaged over the square.
-    points: B x H x W x 3. scale: B, the frames' own: balls whose scale is not within SCALE_RANGE
-    of it are dropped; None asks for a positive scale only. anchors: as draw_anchors gives them,
-    any number, -1 for none.
+    The ball of anchor a holds every valid pixel i of the square around it whose true point is
+    within the ball's radius; balls of fewer than FEWEST pixels are dropped. s_a and t_a, along all
+    three axes, minimise the ball's truncated error and are detached. The mean is over the square
+    and the three coordinates.
+
+    Args:
+        points: Predicted points, B x H x W x 3.
+        target: The true geometry of the frames.
+        scale: Scale of each frame's own alignment, B: balls whose scale is not within SCALE_RANGE
+            of it are dropped. None asks for a positive scale only.
+        level: Size and number of the balls.
+        anchors: Flat pixel indices, B x any number, -1 where there is no anchor; None draws
+            them with `draw_anchors`.
+        beta: Errors below it count squared.
+
+    Returns:
+        The loss of each frame, B.
     """
     if anchors is None:
         anchors = draw_anchors(target, level)
@@ -207,7 +197,7 @@ def _balls(target: Target, level: LocalLevel, frame: Tensor, centre: Tensor) -> 
     apart = points[frame[:, None], index] - points[frame, centre][:, None]
     inside = inside & target.valid.flatten(1)[frame[:, None], index]
     inside = inside & (apart.norm(dim=-1) <= radius[:, None])
-    kept = inside.sum(-1) >= FEWEST_IN_BALL
+    kept = inside.sum(-1) >= FEWEST
     return _Balls(frame[kept], radius[kept], len(offsets), index[kept], inside[kept])
 
 

@@ -1,4 +1,4 @@
-"""Where geometry is finite: the squared error of the raw mask (paper section 4)."""
+"""L_mask: where geometry is finite (paper section 4)."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from dyfn_core.losses.target import Target
 
 
 def mask_loss(mask: Tensor, target: Target) -> Tensor:
-    """Mean (mask - wanted)^2, wanted 1 on valid and 0 on infinite pixels; others do not count.
+    """L_mask = mean_i (m_i - m*_i)^2, m* 1 on valid and 0 on infinite pixels (paper section 4).
 
-    mask: B x H x W raw mask output.
+    The mean is MoGe's: over all pixels, those that are neither valid nor infinite being 0.
+
+    Args:
+        mask: Raw mask output, B x H x W.
+        target: The true geometry of the frames.
+
+    Returns:
+        The loss of each frame, B.
     """
-    counted = target.valid | target.infinite
-    error = (mask - target.valid.float()).square()
-    return (error * counted).sum() / counted.sum().clamp(min=1)
-
-
-def mask_pixel_loss(mask: Tensor, target: Target) -> Tensor:
-    """The same error as MoGe averages it: B, over all pixels, uncounted ones being 0."""
     counted = target.valid | target.infinite
     return ((mask - target.valid.float()).square() * counted).mean((-2, -1))

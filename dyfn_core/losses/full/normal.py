@@ -1,15 +1,14 @@
-"""The angle between predicted and true surface normals (paper section 4)."""
+"""L_normal: the angle between predicted and true surface normals (paper section 4)."""
 
 from __future__ import annotations
 
 import math
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from dyfn_core.losses.full.whole_frame import smooth
 from dyfn_core.losses.target import Target
-from dyfn_core.losses.whole_frame import smooth
 
 SMALLEST, LARGEST = math.radians(1), math.radians(90)
 SMALLEST_STEP = math.radians(0.1)
@@ -17,35 +16,20 @@ HUBER = math.radians(3)
 DEGENERATE = 1e-6
 
 
-def normal_loss(points: Tensor, target: Target, stride: int = 1) -> Tensor:
-    """Mean Huber loss of the angles, clamped to 1..90 degrees, over quads of valid neighbours.
+def normal_loss(points: Tensor, target: Target) -> Tensor:
+    """L_normal = mean_i sum_c huber(angle(n_ic, n*_ic)) / (4 max(H, W)) (paper section 4; MoGe).
 
-    points: B x H x W x 3. Normals are cross products of the differences to the right and lower
-    neighbour, which no scale or shift changes. stride: distance of the neighbours in pixels;
-    over one pixel the gradient is mostly the prediction's noise, until that is very small.
-    """
-    ours, theirs = (_normals(p[:, ::stride, ::stride]) for p in (points, target.points))
-    known = target.valid[:, ::stride, ::stride]
-    valid = known[:, :-1, :-1] & known[:, 1:, :-1] & known[:, :-1, 1:]
-    # atan2 keeps a useful gradient at small angles, where acos has none.
-    sine = torch.linalg.cross(ours, theirs).square().sum(-1).add(1e-12).sqrt()
-    angle = torch.atan2(sine, (ours * theirs).sum(-1)).clamp(SMALLEST, LARGEST)
-    loss = F.huber_loss(angle, torch.zeros_like(angle), reduction="none", delta=HUBER) / HUBER
-    return (loss * valid).sum() / valid.sum().clamp(min=1)
+    c runs over the four corners of the quad of pixels i, whose normals are cross products of its
+    two sides there; no scale or shift changes them. Angles are clamped to 1..90 degrees, the Huber
+    loss is linear above 3 degrees. A corner counts 0 where one of its three points is not valid or
+    where it is degenerate.
 
+    Args:
+        points: Predicted points, B x H x W x 3.
+        target: The true geometry of the frames.
 
-def _normals(points: Tensor) -> Tensor:
-    corner = points[:, :-1, :-1]
-    down, right = points[:, 1:, :-1] - corner, points[:, :-1, 1:] - corner
-    return F.normalize(torch.linalg.cross(down, right), dim=-1, eps=1e-12)
-
-
-def corner_normal_loss(points: Tensor, target: Target) -> Tensor:
-    """MoGe's normal term: B, from the normals at all four corners of every quad of pixels.
-
-    points: B x H x W x 3. The Huber loss of each angle, clamped to 1..90 degrees, is 0 where one
-    of the three points is not valid or the corner is degenerate; their sum over the corners,
-    averaged over quads, is divided by 4 max(H, W).
+    Returns:
+        The loss of each frame, B.
     """
     height, width = points.shape[1:3]
     total = points.new_zeros(len(points), height - 1, width - 1)
@@ -64,9 +48,16 @@ def corner_normal_loss(points: Tensor, target: Target) -> Tensor:
 
 
 def edge_loss(points: Tensor, target: Target) -> Tensor:
-    """MoGe's edge term: B, the angles between true and predicted steps to the next pixel.
+    """MoGe's edge term: the angles between true and predicted steps to the next pixel.
 
-    points: B x H x W x 3. For training without normals; no part of the paper's objective.
+    For training without normals; no part of the paper's objective.
+
+    Args:
+        points: Predicted points, B x H x W x 3.
+        target: The true geometry of the frames.
+
+    Returns:
+        The loss of each frame, B.
     """
     height, width = points.shape[1:3]
     total = points.new_zeros(len(points))
@@ -80,7 +71,15 @@ def edge_loss(points: Tensor, target: Target) -> Tensor:
 
 
 def angle_between(first: Tensor, second: Tensor) -> Tensor:
-    """Angles of vectors ... x 3, radians; atan2 keeps a gradient at small ones."""
+    """Measure angles with atan2, which keeps a gradient at small ones.
+
+    Args:
+        first: Vectors, ... x 3.
+        second: The others, ... x 3.
+
+    Returns:
+        Angles, radians.
+    """
     sine = torch.linalg.cross(first, second).norm(dim=-1) + 1e-12
     return torch.atan2(sine, (first * second).sum(-1))
 

@@ -9,26 +9,39 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dyfn_core.losses.clip_alignment import ClipTarget, align_clips_fully, clip_alignment_loss
-from dyfn_core.losses.local import RELEASED_LEVELS, TEXT_LEVELS, LocalLevel, ball_loss
-from dyfn_core.losses.mask import mask_pixel_loss
-from dyfn_core.losses.normal import corner_normal_loss, edge_loss
-from dyfn_core.losses.temporal import released_temporal_loss, temporal_loss, window_pairs
-from dyfn_core.losses.whole_frame import align_frames_fully, aligned_frame_loss
-
-FORMS = ("text", "released")
+from dyfn_core.losses.clip_alignment import clip_alignment_loss
+from dyfn_core.losses.full.clip_alignment import align_clips
+from dyfn_core.losses.full.local import TEXT_LEVELS, LocalLevel, local_loss
+from dyfn_core.losses.full.mask import mask_loss
+from dyfn_core.losses.full.normal import edge_loss, normal_loss
+from dyfn_core.losses.full.temporal import FORMS, temporal_loss
+from dyfn_core.losses.full.whole_frame import align_frames, global_loss
+from dyfn_core.losses.target import ClipTarget
 
 
 @dataclass(frozen=True)
 class Objective:
-    """Weights of the terms (a term of weight 0 is not computed) and what shapes them.
+    """L = L_MoGe + 1.0 L_align + 0.1 L_temp (paper section 4).
 
-    align_first, align_all: L_align under the alignment of the first frame or of all. frame: MoGe's
-    per-frame global term. local: L_local, of each level. normal, mask, edge: MoGe's. temporal:
-    L_temp. form: "text" (motion in magnitude, errors averaged over what is valid) or "released"
-    (motion vectors, errors averaged over all pixels and coordinates, and the temporal term
-    averaged with the frames' losses as one more of them).
-    resolution, all_resolution: grids of the alignments of one frame and of all frames.
+    L_MoGe = L_local + L_normal + L_mask, and the released code's L_global. A term of weight 0 is
+    not computed.
+
+    Attributes:
+        align_first: Weight of L_align under the alignment of the first frame.
+        align_all: Weight of L_align under the alignment of all frames.
+        frame: Weight of MoGe's per-frame global term.
+        local: Weight of L_local, of each level.
+        normal: Weight of L_normal.
+        mask: Weight of L_mask.
+        edge: Weight of MoGe's edge term, which is no part of the paper's objective.
+        temporal: Weight of L_temp.
+        form: "text" (motion in magnitude, errors averaged over what is valid) or "released" (motion
+            vectors, errors averaged over all pixels and coordinates, and the temporal term averaged
+            with the frames' losses as one more of them).
+        levels: Of L_local.
+        windows: Distances k of L_temp, in frames.
+        resolution: Side of the grid that one frame is aligned on.
+        all_resolution: Side of the grid of each frame when all are aligned at once.
     """
 
     align_first: float = 1.0
@@ -51,7 +64,18 @@ class Objective:
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Objective:
-        """From plain values, `levels` being mappings of LocalLevel's fields."""
+        """Make an objective from plain values.
+
+        Args:
+            values: Fields of Objective; `levels` may be mappings of LocalLevel's fields.
+
+        Returns:
+            The objective.
+
+        Raises:
+            ValueError: For an unknown form.
+            TypeError: For an unknown field.
+        """
         plain: dict[str, Any] = {
             key: tuple(v) if isinstance(v, list) else v for key, v in values.items()
         }
@@ -76,60 +100,72 @@ class Objective:
         target: ClipTarget,
         anchors: Mapping[LocalLevel, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Every term that counts, unweighted, by name.
+        """Compute every term that counts, unweighted.
 
-        points: B x T x H x W x 3; mask: B x T x H x W raw. anchors: the local term's anchors by
-        level, (B * T) x A flat pixel indices; drawn with torch's generator where absent.
+        Args:
+            points: Predicted points, B x T x H x W x 3.
+            mask: Raw mask output, B x T x H x W.
+            target: The true geometry of the clips.
+            anchors: Anchors of L_local by level, flat pixel indices (B * T) x A; drawn with
+                torch's generator where absent.
+
+        Returns:
+            Terms by name, as in `weights`.
         """
         flat, frames = points.flatten(0, 1), target.frames
         wanted = self.weights()
         terms = {}
         first = None
         if {"align_first", "temporal"} & set(wanted):
-            first = align_clips_fully(points, target, "first", self.resolution)
+            first = align_clips(points, target, "first", self.resolution)
         if first is not None and "align_first" in wanted:
             terms["align_first"] = self._clips(points, target, *first)
         if "align_all" in wanted:
-            every = align_clips_fully(points, target, "all", self.all_resolution)
+            every = align_clips(points, target, "all", self.all_resolution)
             terms["align_all"] = self._clips(points, target, *every)
         own = None
         if "frame" in wanted or (self.local > 0 and self.levels):
-            own = align_frames_fully(flat, frames, self.resolution)
+            own = align_frames(flat, frames, self.resolution)
         if own is not None and "frame" in wanted:
-            terms["frame"] = aligned_frame_loss(flat, frames, *own).mean()
+            terms["frame"] = global_loss(flat, frames, *own).mean()
         if own is not None and self.local > 0:
             for i, level in enumerate(self.levels):
                 given = None if anchors is None else anchors.get(level)
-                terms[f"local_{i}"] = ball_loss(flat, frames, level, own[0], given).mean()
+                terms[f"local_{i}"] = local_loss(flat, frames, own[0], level, given).mean()
         if "normal" in wanted:
-            terms["normal"] = corner_normal_loss(flat, frames).mean()
+            terms["normal"] = normal_loss(flat, frames).mean()
         if "edge" in wanted:
             terms["edge"] = edge_loss(flat, frames).mean()
         if "mask" in wanted:
-            terms["mask"] = mask_pixel_loss(mask.flatten(0, 1), frames).mean()
+            terms["mask"] = mask_loss(mask.flatten(0, 1), frames).mean()
         if first is not None and "temporal" in wanted:
-            terms["temporal"] = self._temporal(points, target, first[0])
+            terms["temporal"] = temporal_loss(points, target, first[0], self.windows, self.form)
         return terms
 
     def _clips(self, points: Tensor, target: ClipTarget, scale: Tensor, shift: Tensor) -> Tensor:
         if self.form == "text":
             return clip_alignment_loss(points, target, scale, shift)
         frames = target.length
-        return aligned_frame_loss(
+        return global_loss(
             points.flatten(0, 1),
             target.frames,
             scale.repeat_interleave(frames),
             shift.repeat_interleave(frames, dim=0),
         ).mean()
 
-    def _temporal(self, points: Tensor, target: ClipTarget, scale: Tensor) -> Tensor:
-        if self.form == "released":
-            return released_temporal_loss(points, target, scale, self.windows)
-        pairs = window_pairs(range(target.length), self.windows)
-        return temporal_loss(points, target, scale, pairs)
-
     def total(self, terms: Mapping[str, Tensor], frames: int | None = None) -> Tensor:
-        """The weighted sum. frames: of the whole batch, for form "released"; see there."""
+        """Add the terms up.
+
+        Args:
+            terms: As `terms` gives them.
+            frames: Number of frames of the whole batch, B * T; form "released" needs it.
+
+        Returns:
+            The weighted sum; with form "released" (frames * others + temporal) / (frames + 1).
+
+        Raises:
+            ValueError: If form "released" is not told the number of frames.
+        """
         weights = self.weights()
         parts = {name: weights[name] * term for name, term in terms.items()}
         if self.form == "text" or "temporal" not in parts:
@@ -139,8 +175,3 @@ class Objective:
         temporal = parts.pop("temporal")
         others = torch.stack(list(parts.values())).sum() if parts else torch.zeros_like(temporal)
         return (frames * others + temporal) / (frames + 1)
-
-
-def released_objective() -> Objective:
-    """What the released training script minimises for synthetic data."""
-    return Objective(form="released", levels=RELEASED_LEVELS, windows=(1, 2, 4, 8))

@@ -14,12 +14,20 @@ TRIM = 0.2
 
 
 def ssi_loss(disparity: Tensor, target: Target, trim: float = TRIM) -> Tensor:
-    """Mean over frames of MiDaS' trimmed absolute error and its multi-scale gradient term.
+    """L_ssi = sum'_i |r_i| / 2N + 0.5 sum_k mean |grad r^k| (MiDaS, eq. 7 and 11; paper section 4).
 
-    disparity: B x H x W, up to scale and shift, compared with 1 / z*. Both are centred on their
-    median and divided by their mean absolute deviation over the frame's valid pixels; the largest
-    `trim` of the residuals do not count. Frames with fewer than FEWEST valid pixels, or without
-    any variation in the truth, contribute nothing; without a usable frame the loss is 0.
+    r is the difference of disparity and 1 / z*, both centred on their median and divided by their
+    mean absolute deviation over the frame's N valid pixels. The sum leaves out the largest `trim`
+    of the residuals; r^k takes every 2^k-th row and column.
+
+    Args:
+        disparity: Predicted disparity up to scale and shift, B x H x W.
+        target: The true geometry of the frames.
+        trim: Share of the residuals that is left out.
+
+    Returns:
+        The mean over frames with FEWEST valid pixels and some variation in the truth; 0 without
+        any.
     """
     valid = target.valid
     truth = torch.where(valid, 1 / torch.where(valid, target.points[..., 2], 1.0), 0.0)

@@ -1,60 +1,50 @@
-"""L_temp: how much points move from frame to frame, compared in magnitude (paper section 4)."""
+"""L_temp: how much points move from frame to frame (paper section 4)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from dyfn_core.losses.clip_alignment import ClipTarget
+from dyfn_core.losses.motion import pair_motion_loss, window_pairs
+from dyfn_core.losses.target import ClipTarget
+
+FORMS = ("text", "released")
 
 
 def temporal_loss(
-    points: Tensor, target: ClipTarget, scale: Tensor, pairs: Sequence[tuple[int, int]]
-) -> Tensor:
-    """Mean of | s |p_i - p_j|_1 - |p*_i - p*_j|_1 | / z*_i over pixels valid in both frames.
-
-    points: B x T x H x W x 3; scale: B, of the clips' alignment (clips of scale 0 do not count).
-    pairs: (i, j), the frames to compare; the windows of the paper are j - i in {1, 2, 4}.
-    Without pairs or common pixels the loss is 0.
-    """
-    if not pairs:
-        return 0.0 * points.sum()  # with a graph, so that the loss alone can be trained on
-    first = torch.tensor([pair[0] for pair in pairs], device=points.device)
-    second = torch.tensor([pair[1] for pair in pairs], device=points.device)
-    moved = (points[:, first] - points[:, second]).abs().sum(-1)
-    truly = (target.points[:, first] - target.points[:, second]).abs().sum(-1)
-    both = target.valid[:, first] & target.valid[:, second]
-    both = both & (scale > 0)[:, None, None, None]
-    error = (scale[:, None, None, None] * moved - truly).abs() * target.weight[:, first]
-    return (error * both).sum() / both.sum().clamp(min=1)
-
-
-def window_pairs(frames: Sequence[int], windows: Sequence[int]) -> list[tuple[int, int]]:
-    """Positions (i, j) of frames whose numbers are one of the windows apart."""
-    place = {frame: position for position, frame in enumerate(frames)}
-    return [
-        (position, place[frame + window])
-        for position, frame in enumerate(frames)
-        for window in windows
-        if frame + window in place
-    ]
-
-
-def released_temporal_loss(
     points: Tensor,
     target: ClipTarget,
     scale: Tensor,
-    windows: Sequence[int] = (1, 2, 4, 8),
+    windows: Sequence[int] = (1, 2, 4),
+    form: str = "text",
 ) -> Tensor:
-    """The released code's form: sum over windows of the error of the motion vectors.
+    """L_temp = mean (1 / z*_i) | s |p_j - p_{j+k}|_1 - |p*_j - p*_{j+k}|_1 | (paper section 4).
 
-    |s (p_j - p_{j+k}) - (p*_j - p*_{j+k})| over the mean depth of the pair, averaged over all
-    coordinates and pixels, those not valid in both frames being 0. points: B x T x H x W x 3;
-    scale: B, clips of scale 0 count 0. Windows that do not fit into the clip count 0 (the
-    released code is NaN then).
+    The released code compares vectors: sum_k mean |s (p_j - p_{j+k}) - (p*_j - p*_{j+k})| / z,
+    with the mean depth z of the pair, over all pixels and coordinates, those that are not valid
+    in both frames being 0.
+
+    Args:
+        points: Predicted points, B x T x H x W x 3.
+        target: The true geometry of the clips.
+        scale: Scale of each clip's alignment, B; clips of scale 0 do not count.
+        windows: Distances k, in frames; the released code has 1, 2, 4 and 8.
+        form: "text" for the paper's form, "released" for that of the released code.
+
+    Returns:
+        The mean over pixels that are valid in both frames (text), or the sum over windows
+        (released). Windows that do not fit into the clip count 0; the released code is NaN then.
     """
+    if form == "released":
+        return _vector_loss(points, target, scale, windows)
+    pairs = window_pairs(range(target.length), windows)
+    return pair_motion_loss(points, target, scale, pairs)
+
+
+def _vector_loss(
+    points: Tensor, target: ClipTarget, scale: Tensor, windows: Sequence[int]
+) -> Tensor:
     loss = 0.0 * points.sum()  # with a graph also when no window fits
     true = target.points
     for window in windows:

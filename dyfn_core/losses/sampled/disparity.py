@@ -8,29 +8,40 @@ import torch
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import align_scale_shift
-from dyfn_core.losses.clip_alignment import (
-    ALL_GRID,
-    ANCHORS,
-    FIRST_GRID,
-    TRUNC,
-    ClipTarget,
-    check_mode,
-)
+from dyfn_core.losses.clip_alignment import check_mode
 from dyfn_core.losses.resample import pick
-from dyfn_core.losses.whole_frame import coarse_samples
+from dyfn_core.losses.sampled.clip_alignment import ALL_GRID, ANCHORS, FIRST_GRID, TRUNC
+from dyfn_core.losses.sampled.whole_frame import coarse_samples
+from dyfn_core.losses.target import ClipTarget
 
 
 def true_disparity(target: ClipTarget) -> tuple[Tensor, Tensor]:
-    """1 / z* and the weight z* that makes its errors relative, 0 where invalid: B x T x H x W."""
+    """The disparity to compare with, and its weight.
+
+    Args:
+        target: The true geometry of the clips.
+
+    Returns:
+        1 / z* and z*, which makes the errors relative, both B x T x H x W and 0 where invalid.
+    """
     depth = torch.where(target.valid, target.points[..., 2], 1.0)
     return target.valid / depth, target.valid * depth
 
 
 def align_disparity(disparity: Tensor, target: ClipTarget, mode: str) -> tuple[Tensor, Tensor]:
-    """One scale and shift (B each) per clip that bring B x T x H x W disparity to 1 / z*.
+    """argmin_(s, t) sum_i min(1, z*_i |s d_i + t - 1 / z*_i|), on a coarse grid, detached.
 
-    mode: "first" or "all", as for points; detached. Scale 0 where nothing can be aligned or the
-    best scale is not positive. Raises ValueError on another mode.
+    Args:
+        disparity: Predicted disparity, B x T x H x W.
+        target: The true geometry of the clips.
+        mode: "first" fits to the first frame alone, "all" to samples of every frame.
+
+    Returns:
+        Scale and shift, B each; scale 0 where nothing can be aligned or the best scale is not
+        positive.
+
+    Raises:
+        ValueError: For another mode.
     """
     check_mode(mode)
     frames = 1 if mode == "first" else target.length
@@ -50,7 +61,17 @@ def align_disparity(disparity: Tensor, target: ClipTarget, mode: str) -> tuple[T
 def disparity_alignment_loss(
     disparity: Tensor, target: ClipTarget, scale: Tensor, shift: Tensor
 ) -> Tensor:
-    """Mean over clips of mean_ji z*_ji |s d_ji + t - 1 / z*_ji|: B x T x H x W, scale, shift B."""
+    """L_align in disparity space: mean_ji z*_ji |s d_ji + t - 1 / z*_ji| (paper section 4).
+
+    Args:
+        disparity: Predicted disparity, B x T x H x W.
+        target: The true geometry of the clips.
+        scale: Scale of each clip's alignment, B.
+        shift: Its shift, B.
+
+    Returns:
+        The mean over clips with an alignment and a valid pixel; 0 without any.
+    """
     truth, weight = true_disparity(target)
     aligned = scale[:, None, None, None] * disparity + shift[:, None, None, None]
     error = weight * (aligned - truth).abs()
@@ -63,10 +84,16 @@ def disparity_alignment_loss(
 def disparity_temporal_loss(
     disparity: Tensor, target: ClipTarget, scale: Tensor, pairs: Sequence[tuple[int, int]]
 ) -> Tensor:
-    """Mean of z*_i | s |d_i - d_j| - |1/z*_i - 1/z*_j| | over pixels valid in both frames.
+    """L_temp in disparity space: mean z*_i | s |d_i - d_j| - |1/z*_i - 1/z*_j| | (paper section 4).
 
-    disparity: B x T x H x W; scale: B, of the clips' alignment (clips of scale 0 do not count).
-    pairs: (i, j), the frames to compare. Without pairs or common pixels the loss is 0.
+    Args:
+        disparity: Predicted disparity, B x T x H x W.
+        target: The true geometry of the clips.
+        scale: Scale of each clip's alignment, B; clips of scale 0 do not count.
+        pairs: Positions (i, j) of the frames to compare.
+
+    Returns:
+        The mean over pixels that are valid in both frames; 0 without pairs or common pixels.
     """
     if not pairs:
         return (disparity * 0).sum()

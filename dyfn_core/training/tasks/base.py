@@ -14,11 +14,11 @@ from torch import Tensor
 from dyfn_core.data.clips import ClipBatch, ClipSource, SizeStage, batch_loader, find_sequences
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
 from dyfn_core.losses.gradient import gradient_loss
-from dyfn_core.losses.local import local_loss
-from dyfn_core.losses.mask import mask_loss
-from dyfn_core.losses.normal import normal_loss
+from dyfn_core.losses.sampled.local import local_loss
+from dyfn_core.losses.sampled.mask import mask_loss
+from dyfn_core.losses.sampled.normal import normal_loss
+from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.target import target_from_depth
-from dyfn_core.losses.whole_frame import whole_frame_loss
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.efficientnet import Block, EfficientNetLite0
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
@@ -92,7 +92,8 @@ class BaseTask(Task):
     ) -> tuple[Tensor, dict[str, float]]:
         target = target_from_depth(batch.depth[:, 0], batch.intrinsics[:, 0], aspect)
         points = remap_exp(raw)
-        frame, scale = whole_frame_loss(points, target)
+        scale, shift = align_frames(points, target)
+        frame = global_loss(points, target, scale, shift)
         local = [
             local_loss(points, target, scale, alpha, balls)
             for alpha, balls in zip(LOCAL_LEVELS, self.config.balls, strict=True)

@@ -14,18 +14,20 @@ import torch
 from torch import Tensor
 
 from dyfn_core.data.clips import batch_loader, draw_batch, find_sequences
-from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
-from dyfn_core.losses.disparity import (
+from dyfn_core.losses.clip_alignment import clip_alignment_loss
+from dyfn_core.losses.full.objective import Objective
+from dyfn_core.losses.full.ssi import ssi_loss
+from dyfn_core.losses.motion import window_pairs
+from dyfn_core.losses.sampled.clip_alignment import align_clips
+from dyfn_core.losses.sampled.disparity import (
     align_disparity,
     disparity_alignment_loss,
     disparity_temporal_loss,
 )
-from dyfn_core.losses.objective import Objective
+from dyfn_core.losses.sampled.temporal import temporal_loss
+from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
-from dyfn_core.losses.ssi import ssi_loss
-from dyfn_core.losses.target import target_from_depth
-from dyfn_core.losses.temporal import temporal_loss, window_pairs
-from dyfn_core.losses.whole_frame import whole_frame_loss
+from dyfn_core.losses.target import ClipTarget, target_from_depth
 from dyfn_core.models.base import (
     AffineDisparity,
     AffinePoints,
@@ -123,10 +125,11 @@ class StabilizerTask(Task):
             scale, shift = align_clips(points, target, mode, through and mode == "first")
             terms[f"align_{mode}"] = clip_alignment_loss(points, target, scale, shift)
             first_scale = scale if first_scale is None else first_scale
-        pairs = window_pairs(frames, self.config.windows)
         assert first_scale is not None
-        terms["temporal"] = temporal_loss(points, target, first_scale, pairs)
-        terms["frame"] = whole_frame_loss(points.flatten(0, 1), target.frames)[0]
+        windows = self.config.windows
+        terms["temporal"] = temporal_loss(points, target, first_scale, windows, frames)
+        flat = points.flatten(0, 1)
+        terms["frame"] = global_loss(flat, target.frames, *align_frames(flat, target.frames))
         terms["spread"] = scale_spread_loss(points, target)
         return terms
 

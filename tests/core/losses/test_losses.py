@@ -10,14 +10,18 @@ import torch
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import HUBER, canonical_scale_loss
-from dyfn_core.losses.clip_alignment import ClipTarget, align_clips, clip_alignment_loss
-from dyfn_core.losses.local import LocalLevel, ball_loss, local_loss
-from dyfn_core.losses.mask import mask_loss
-from dyfn_core.losses.normal import normal_loss
+from dyfn_core.losses.clip_alignment import clip_alignment_loss
+from dyfn_core.losses.full import local as full_local
+from dyfn_core.losses.full import temporal as full_temporal
+from dyfn_core.losses.motion import pair_motion_loss, window_pairs
+from dyfn_core.losses.sampled.clip_alignment import align_clips
+from dyfn_core.losses.sampled.local import local_loss
+from dyfn_core.losses.sampled.mask import mask_loss
+from dyfn_core.losses.sampled.normal import normal_loss
+from dyfn_core.losses.sampled.temporal import temporal_loss
+from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
-from dyfn_core.losses.target import Target, target_from_depth
-from dyfn_core.losses.temporal import released_temporal_loss, temporal_loss, window_pairs
-from dyfn_core.losses.whole_frame import whole_frame_loss
+from dyfn_core.losses.target import ClipTarget, Target, target_from_depth
 
 INTRINSICS = torch.tensor([0.8, 1.0667, 0.5, 0.5])
 ASPECT = 4 / 3
@@ -38,6 +42,11 @@ def affine(points: Tensor, scale: float, shift: float) -> Tensor:
     return (points - torch.tensor([0.0, 0.0, shift])) / scale
 
 
+def whole_frames(points: Tensor, target: Target) -> Tensor:
+    """The global loss under each frame's own alignment."""
+    return global_loss(points, target, *align_frames(points, target))
+
+
 def test_target_projects_back_onto_its_pixels() -> None:
     target = scene(1)
     points = target.points[0, 10, 7]
@@ -54,10 +63,10 @@ def test_target_projects_back_onto_its_pixels() -> None:
 def test_frame_loss_ignores_scale_and_shift_of_each_frame() -> None:
     target = scene()
     exact = torch.stack([affine(target.points[0], 2, 0.5), affine(target.points[1], 0.1, -1)])
-    loss, scale = whole_frame_loss(exact, target)
+    scale, _ = align_frames(exact, target)
     torch.testing.assert_close(scale, torch.tensor([2.0, 0.1]))
-    assert float(loss) < 1e-5
-    assert float(whole_frame_loss(exact + 0.2 * torch.rand_like(exact), target)[0]) > 0.02
+    assert float(whole_frames(exact, target)) < 1e-5
+    assert float(whole_frames(exact + 0.2 * torch.rand_like(exact), target)) > 0.02
 
 
 def test_frame_loss_of_a_known_error_is_that_error_over_depth() -> None:
@@ -65,7 +74,7 @@ def test_frame_loss_of_a_known_error_is_that_error_over_depth() -> None:
     target = scene(1)
     wrong = target.points.clone()
     wrong[0, 12, 12, 0] += 0.3
-    loss, _ = whole_frame_loss(wrong, target)
+    loss = whole_frames(wrong, target)
     expected = 0.3 / target.points[0, 12, 12, 2] / target.valid.sum()
     torch.testing.assert_close(loss, expected, rtol=1e-3, atol=0)
 
@@ -74,7 +83,7 @@ def test_frame_upside_down_or_empty_counts_nothing_and_breaks_nothing() -> None:
     target = scene(2)
     nothing = Target(target.points, torch.zeros_like(target.valid), target.infinite, target.focal)
     points = target.points.clone().requires_grad_()
-    loss, _ = whole_frame_loss(points, nothing)
+    loss = whole_frames(points, nothing)
     loss = loss + local_loss(points, nothing, torch.ones(2), 0.25, 4)
     loss = loss + normal_loss(points, nothing) + mask_loss(points[..., 0], nothing) * 0
     loss.backward()
@@ -90,14 +99,14 @@ def test_local_loss_ignores_what_happens_between_the_balls() -> None:
     torn[:, :, 32:] = affine(torn[:, :, 32:], 2.0, 0.3)
     torch.manual_seed(0)
     local = local_loss(torn, target, torch.ones(1), 1 / 4, 64)
-    assert float(local) < 0.5 * float(whole_frame_loss(torn, target)[0])
+    assert float(local) < 0.5 * float(whole_frames(torn, target))
     torch.manual_seed(0)
     assert float(local_loss(target.points, target, torch.ones(1), 1 / 4, 64)) < 1e-5
 
 
 def test_balls_of_the_finest_level_by_plain_loops() -> None:
     """An affine copy of the truth with a few outliers: the best fit of every ball is known."""
-    level, scale, shift = LocalLevel(1 / 32, 6, 4), 2.0, torch.tensor([0.1, -0.2, 0.3])
+    level, scale, shift = full_local.LocalLevel(1 / 32, 6, 4), 2.0, torch.tensor([0.1, -0.2, 0.3])
     target = scene(1, size=(240, 320))
     truth = target.points[0].double().numpy()
     predicted = (target.points - shift) / scale
@@ -121,8 +130,8 @@ def test_balls_of_the_finest_level_by_plain_loops() -> None:
             weight = 1 / max(truth[i, j, 2], 0.1 * typical)
             wanted += scale * float(error[0, i, j].sum()) * weight / (3 * (2 * reach + 1) ** 2)
     assert max(held) >= 32
-    found = ball_loss(
-        predicted + error, target, level, torch.tensor([scale]), torch.tensor([anchors])
+    found = full_local.local_loss(
+        predicted + error, target, torch.tensor([scale]), level, torch.tensor([anchors])
     )
     assert found.item() == pytest.approx(wanted / len(anchors), rel=1e-3)
 
@@ -167,7 +176,7 @@ def test_clip_alignment_sees_a_drift_that_frames_alone_do_not() -> None:
     target = clip()
     drift = torch.linspace(1, 2, 5)[None, :, None, None, None]
     points = target.points * drift
-    alone, _ = whole_frame_loss(points.flatten(0, 1), target.frames)
+    alone = whole_frames(points.flatten(0, 1), target.frames)
     scale, shift = align_clips(points, target, "first")
     together = clip_alignment_loss(points, target, scale, shift)
     assert float(alone) < 1e-4
@@ -202,24 +211,27 @@ def scene_part(target: ClipTarget, start: int) -> Target:
 
 def test_temporal_loss_compares_how_far_points_move() -> None:
     target = clip()
-    pairs = window_pairs([0, 1, 2, 3, 4], (1, 2, 4))
-    assert len(pairs) == 4 + 3 + 1
-    scale = torch.full((2,), 0.5)
-    assert float(temporal_loss(affine(target.points, 0.5, 2.0), target, scale, pairs)) < 1e-4
+    windows, frames, scale = (1, 2, 4), range(5), torch.full((2,), 0.5)
+    assert len(window_pairs(frames, windows)) == 4 + 3 + 1
+    still = affine(target.points, 0.5, 2.0)
+    assert float(temporal_loss(still, target, scale, windows, frames)) < 1e-4
     drift = torch.linspace(1, 2, 5)[None, :, None, None, None]
-    assert float(temporal_loss(affine(target.points, 0.5, 0) * drift, target, scale, pairs)) > 0.1
+    moving = affine(target.points, 0.5, 0) * drift
+    loss = temporal_loss(moving, target, scale, windows, frames)
+    assert float(loss) > 0.1
+    assert torch.equal(loss, full_temporal.temporal_loss(moving, target, scale, windows))
 
 
 def test_temporal_loss_without_pairs_or_alignment_is_zero() -> None:
     target = clip()
     points = target.points.clone().requires_grad_()
-    alone = temporal_loss(points, target, torch.ones(2), [])
-    released = released_temporal_loss(points, target, torch.ones(2), [8])
+    alone = pair_motion_loss(points, target, torch.ones(2), [])
+    released = full_temporal.temporal_loss(points, target, torch.ones(2), [8], "released")
     (alone + released).backward()
     assert alone.item() == 0
     assert released.item() == 0
     assert points.grad is not None and not points.grad.any()
-    assert float(temporal_loss(target.points * 2, target, torch.zeros(2), [(0, 1)])) == 0
+    assert float(pair_motion_loss(target.points * 2, target, torch.zeros(2), [(0, 1)])) == 0
 
 
 def test_pairs_are_found_among_frames_that_were_chosen() -> None:

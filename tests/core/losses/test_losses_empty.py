@@ -11,39 +11,37 @@ import torch
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
-from dyfn_core.losses.clip_alignment import (
-    ClipTarget,
-    align_clips,
-    align_clips_fully,
-    clip_alignment_loss,
-)
-from dyfn_core.losses.disparity import (
+from dyfn_core.losses.clip_alignment import clip_alignment_loss
+from dyfn_core.losses.full import clip_alignment as full_clips
+from dyfn_core.losses.full import local as full_local
+from dyfn_core.losses.full import mask as full_mask
+from dyfn_core.losses.full import normal as full_normal
+from dyfn_core.losses.full import temporal as full_temporal
+from dyfn_core.losses.full import whole_frame as full_frames
+from dyfn_core.losses.full.objective import Objective
+from dyfn_core.losses.full.ssi import ssi_loss
+from dyfn_core.losses.sampled.clip_alignment import align_clips
+from dyfn_core.losses.sampled.disparity import (
     align_disparity,
     disparity_alignment_loss,
     disparity_temporal_loss,
 )
-from dyfn_core.losses.local import LocalLevel, ball_loss, local_loss
-from dyfn_core.losses.mask import mask_loss, mask_pixel_loss
-from dyfn_core.losses.normal import corner_normal_loss, edge_loss, normal_loss
-from dyfn_core.losses.objective import Objective
+from dyfn_core.losses.sampled.local import local_loss
+from dyfn_core.losses.sampled.mask import mask_loss
+from dyfn_core.losses.sampled.normal import normal_loss
+from dyfn_core.losses.sampled.temporal import temporal_loss
+from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
-from dyfn_core.losses.ssi import ssi_loss
-from dyfn_core.losses.target import target_from_depth
-from dyfn_core.losses.temporal import released_temporal_loss, temporal_loss
-from dyfn_core.losses.whole_frame import (
-    align_frames_fully,
-    aligned_frame_loss,
-    whole_frame_loss,
-)
+from dyfn_core.losses.target import ClipTarget, target_from_depth
 
 FRAMES, HEIGHT, WIDTH = 3, 20, 28
 PAIRS = [(0, 1), (0, 2)]
-LEVEL = LocalLevel(1 / 2, 6, 4)
+LEVEL = full_local.LocalLevel(1 / 2, 6, 4)
 
 
-def aligned(mode: str, fully: bool) -> Callable[[Tensor, ClipTarget], Tensor]:
+def aligned(mode: str, full: bool) -> Callable[[Tensor, ClipTarget], Tensor]:
     def term(points: Tensor, target: ClipTarget) -> Tensor:
-        find = align_clips_fully if fully else align_clips
+        find = full_clips.align_clips if full else align_clips
         return clip_alignment_loss(points, target, *find(points, target, mode))
 
     return term
@@ -59,26 +57,36 @@ def by_frame(term: Callable[..., Tensor]) -> Callable[[Tensor, ClipTarget], Tens
 
 def own_frames(points: Tensor, target: ClipTarget) -> Tensor:
     flat = points.flatten(0, 1)
-    scale, shift = align_frames_fully(flat, target.frames, 8)
-    return aligned_frame_loss(flat, target.frames, scale, shift).sum()
+    return global_loss(flat, target.frames, *align_frames(flat, target.frames))
+
+
+def full_own_frames(points: Tensor, target: ClipTarget) -> Tensor:
+    flat = points.flatten(0, 1)
+    scale, shift = full_frames.align_frames(flat, target.frames, 8)
+    return full_frames.global_loss(flat, target.frames, scale, shift).sum()
 
 
 TERMS: dict[str, Callable[[Tensor, ClipTarget], Tensor]] = {
     "align_first": aligned("first", False),
     "align_all": aligned("all", False),
-    "align_first_fully": aligned("first", True),
-    "align_all_fully": aligned("all", True),
-    "temporal": lambda p, t: temporal_loss(p, t, align_clips(p, t, "first")[0], PAIRS),
-    "temporal_released": lambda p, t: released_temporal_loss(
+    "full_align_first": aligned("first", True),
+    "full_align_all": aligned("all", True),
+    "temporal": lambda p, t: temporal_loss(
+        p, t, align_clips(p, t, "first")[0], (1, 2), range(FRAMES)
+    ),
+    "full_temporal": lambda p, t: full_temporal.temporal_loss(
         p, t, align_clips(p, t, "first")[0], (1, 2)
     ),
-    "frame": lambda p, t: whole_frame_loss(p.flatten(0, 1), t.frames)[0],
-    "frame_fully": own_frames,
+    "full_temporal_released": lambda p, t: full_temporal.temporal_loss(
+        p, t, align_clips(p, t, "first")[0], (1, 2), "released"
+    ),
+    "frame": own_frames,
+    "full_frame": full_own_frames,
     "local": lambda p, t: local_loss(p.flatten(0, 1), t.frames, torch.ones(FRAMES), 1 / 2, 6),
-    "balls": by_frame(lambda p, t: ball_loss(p, t, LEVEL)),
+    "full_local": by_frame(lambda p, t: full_local.local_loss(p, t, None, LEVEL)),
     "normal": by_frame(normal_loss),
-    "normal_corners": by_frame(corner_normal_loss),
-    "edge": by_frame(edge_loss),
+    "full_normal": by_frame(full_normal.normal_loss),
+    "edge": by_frame(full_normal.edge_loss),
     "canonical_scale": by_frame(canonical_scale_loss),
     "spread": scale_spread_loss,
     "ssi": lambda p, t: ssi_loss(disparity_of(p).flatten(0, 1), t.frames),
@@ -91,8 +99,8 @@ TERMS: dict[str, Callable[[Tensor, ClipTarget], Tensor]] = {
 }
 # These see single frames, or compare frames under an alignment from all: one frame is enough.
 ALONE = {
-    "align_first", "align_all", "align_first_fully", "align_all_fully", "frame", "frame_fully",
-    "local", "balls", "normal", "normal_corners", "edge", "canonical_scale", "ssi",
+    "align_first", "align_all", "full_align_first", "full_align_all", "frame", "full_frame",
+    "local", "full_local", "normal", "full_normal", "edge", "canonical_scale", "ssi",
     "disparity_align",
 }  # fmt: skip
 
@@ -165,7 +173,7 @@ def test_clip_with_truth_has_a_gradient(name: str) -> None:
 def test_masks_see_the_sky_but_not_the_unknown(kind: str) -> None:
     frames = target_from_depth(depth(kind), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
     mask = torch.full((FRAMES, HEIGHT, WIDTH), 0.5, requires_grad=True)
-    loss = mask_loss(mask, frames) + mask_pixel_loss(mask, frames).sum()
+    loss = mask_loss(mask, frames) + full_mask.mask_loss(mask, frames).sum()
     loss.backward()
     assert mask.grad is not None
     assert bool(mask.grad.any()) == (kind == "infinite")

@@ -20,27 +20,27 @@ import torch
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import truncated_error
-from dyfn_core.losses.clip_alignment import ClipTarget, align_clips_fully
-from dyfn_core.losses.local import (
+from dyfn_core.losses.full.clip_alignment import align_clips
+from dyfn_core.losses.full.local import (
+    TEXT_LEVELS,
     LocalLevel,
     anchor_chance,
-    ball_loss,
     draw_anchors,
+    local_loss,
     square_radius,
 )
-from dyfn_core.losses.mask import mask_pixel_loss
-from dyfn_core.losses.normal import corner_normal_loss, edge_loss
-from dyfn_core.losses.objective import released_objective
+from dyfn_core.losses.full.mask import mask_loss
+from dyfn_core.losses.full.normal import edge_loss, normal_loss
+from dyfn_core.losses.full.objective import Objective
+from dyfn_core.losses.full.temporal import temporal_loss
+from dyfn_core.losses.full.whole_frame import align_frames, global_loss
 from dyfn_core.losses.resample import nearest_valid, pick
-from dyfn_core.losses.target import Target
-from dyfn_core.losses.temporal import released_temporal_loss
-from dyfn_core.losses.whole_frame import (
-    align_frames_fully,
-    aligned_frame_loss,
-    sparsity_weight,
-)
+from dyfn_core.losses.target import ClipTarget, Target
 from dyfn_core.models.moge import remap_points
 
+# What the released training configuration sets otherwise than the paper's text.
+RELEASED_LEVELS = (*TEXT_LEVELS[:2], LocalLevel(1 / 64, 4096, 4))
+RELEASED_WINDOWS = (1, 2, 4, 8)
 SCENES = ("t4_32x40", "t12_32x40", "t1_96x128", "t1_288x384")
 NOT_COMPARED = re.compile(
     r"gram_anchoring_loss|monitoring|align_affine_lstsq|align_depth_affine_irls|/scene$"
@@ -106,7 +106,7 @@ def own_alignment(
     """Several cases ask for the same solution."""
     points, target = scene(shared, f"{name}/scene")
     one = points[index : index + 1]
-    return align_frames_fully(one, frame(target, index), resolution, trunc)
+    return align_frames(one, frame(target, index), resolution, trunc)
 
 
 def test_every_case_is_compared_or_named(shared_dir: Path) -> None:
@@ -189,8 +189,14 @@ def test_clip_alignments(shared_dir: Path) -> None:
             points, target = points[:1], frame(target, 0)
         else:
             clip = ClipTarget(target, len(points))
-            found = align_clips_fully(points[None], clip, "all", resolution, trunc)
+            found = align_clips(points[None], clip, "all", resolution, trunc)
         check_alignment(shared_dir, case, found, points, target)
+
+
+def sparsity_weight(target: Target, resolution: int) -> Tensor:
+    """What the released code multiplies a frame's loss by: sparse truth counts like dense truth."""
+    seen = nearest_valid(target.valid, (resolution, resolution))[1].float().mean(-1)
+    return 1 / (target.valid.float().mean((-2, -1)) / seen.clamp(min=1e-7) + 1e-7)
 
 
 def test_frames_under_an_alignment(shared_dir: Path) -> None:
@@ -203,7 +209,7 @@ def test_frames_under_an_alignment(shared_dir: Path) -> None:
         one = frame(target, index)
         own = points[index : index + 1].clone().requires_grad_()
         scale, shift = (tensor(shared_dir, f"{case}/out/{key}")[None] for key in ("scale", "shift"))
-        loss = aligned_frame_loss(own, one, scale, shift, options.get("beta", 0.0))
+        loss = global_loss(own, one, scale, shift, options.get("beta", 0.0))
         resolution = options["align_resolution"]
         if options.get("sparsity_aware"):
             loss = loss * sparsity_weight(one, resolution)
@@ -223,7 +229,7 @@ def test_normals_edges_and_masks(shared_dir: Path) -> None:
         index = int(which.removeprefix("frame"))
         points, target = scene(shared_dir, f"{name}/scene")
         own = points[index : index + 1].clone().requires_grad_()
-        term = corner_normal_loss if kind == "normal_loss" else edge_loss
+        term = normal_loss if kind == "normal_loss" else edge_loss
         loss = term(own, frame(target, index))
         loss.sum().backward()
         torch.testing.assert_close(
@@ -236,7 +242,7 @@ def test_normals_edges_and_masks(shared_dir: Path) -> None:
         _, target = scene(shared_dir, f"{name}/scene")
         # Which pixels are positive is its own array, though it never differs from the mask's.
         mask = tensor(shared_dir, f"{name}/scene/in/pred_mask")[index : index + 1]
-        loss = mask_pixel_loss(mask, frame(target, index))
+        loss = mask_loss(mask, frame(target, index))
         torch.testing.assert_close(loss[0], tensor(shared_dir, f"{case}/out/l2"))
 
 
@@ -262,7 +268,7 @@ def test_balls(shared_dir: Path) -> None:
         rows, cols = (tensor(shared_dir, f"{case}/in/anchor_{axis}").long() for axis in "ij")
         anchors = (rows * points.shape[2] + cols)[None]
         own = points.clone().requires_grad_()
-        loss = ball_loss(own, target, level, scale, anchors)
+        loss = local_loss(own, target, scale, level, anchors)
         loss.sum().backward()
         wanted = tensor(shared_dir, f"{case}/out/loss")
         if rounded(case):  # other, better alignments of some balls: see check_alignment
@@ -293,7 +299,9 @@ def test_motion_vectors(shared_dir: Path) -> None:
         points, target = scene(shared_dir, f"{case.split('/')[0]}/scene")
         scale = tensor(shared_dir, f"{case}/in/scale")[None]
         own = points[None].clone().requires_grad_()
-        loss = released_temporal_loss(own, ClipTarget(target, len(points)), scale)
+        loss = temporal_loss(
+            own, ClipTarget(target, len(points)), scale, RELEASED_WINDOWS, "released"
+        )
         wanted = tensor(shared_dir, f"{case}/out/loss")
         if torch.isnan(wanted):  # the released code on a clip too short for its windows
             assert bool(torch.isfinite(loss))
@@ -321,7 +329,7 @@ def test_whole_training_step(shared_dir: Path) -> None:
         ]
         anchors[level] = torch.stack([ij[:, 0] * 64 + ij[:, 1] for ij in drawn])
     own = points[None].clone().requires_grad_()
-    objective = released_objective()
+    objective = Objective(form="released", levels=RELEASED_LEVELS, windows=RELEASED_WINDOWS)
     terms = objective.terms(own, mask[None], ClipTarget(target, 9), anchors)
     wanted = tensor(shared_dir, f"{case}/out/loss_terms_per_frame").float()
     names = ("align_first", "frame", "local_0", "local_1", "local_2", "normal", "mask")

@@ -1,0 +1,1 @@
+"""The paper's objective: every pixel, exact alignments, MoGe's averages."""

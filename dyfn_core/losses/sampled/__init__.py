@@ -1,0 +1,1 @@
+"""Cheap relatives of the paper's terms: a few hundred samples, a few random anchors."""
