@@ -1,29 +1,45 @@
-"""The words that everything else is said in: Frame, StreamState, Prediction."""
+"""The values that go in and come out: Frame, StreamState, Prediction."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Generic
 
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import TypeVar
+
+from dyfn_core.geometry.camera import pixel_intrinsics
 
 DEPTH, DISPARITY = "depth", "disparity"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One camera image as it enters a stream.
+    """One camera image on its way into a stream.
 
-    image: H x W x 3 uint8, RGB.
-    stamp: seconds; None when the source has no clock.
-    camera_matrix: 3 x 3 float64 intrinsics in pixels; None when unknown.
+    Attributes:
+        image: H x W x 3 uint8, RGB.
+        stamp: Seconds; None when the source has no clock.
+        camera_matrix: 3 x 3 float64 intrinsics in pixels; None when unknown.
+        visible: H x W bool, False where the image shows nothing (the border of an undistorted
+            image); None: everything is visible.
+        frame_id: Name of the optical frame. Another name is another camera.
     """
 
     image: np.ndarray
     stamp: float | None = None
     camera_matrix: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    frame_id: str = ""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the image."""
+        return self.image.shape[0], self.image.shape[1]
 
 
 @dataclass(frozen=True)
@@ -90,25 +106,87 @@ def _cat(rows: Sequence[Tensor | None]) -> Tensor | None:
     return torch.cat(known) if known else None
 
 
-@dataclass(frozen=True)
-class Prediction:
-    """Geometry of one image (or a batch: every field then has a leading B).
+def _array(values: Tensor | np.ndarray) -> np.ndarray:
+    return values.cpu().numpy() if isinstance(values, Tensor) else values
 
-    points: H x W x 3 float32, optical frame (x right, y down, z forward), up to scale.
-    depth: H x W float32, z of the points, up to scale; +inf where the mask is False.
-    mask: H x W bool, True where the prediction is valid.
-    intrinsics: 3 x 3 float32, normalised: pixel x = (u + 0.5) / W, y = (v + 0.5) / H.
-    state: goes into the next call of the same stream; None for a model without stabilizer.
-    quantity: what the model predicts. "depth": depth is right up to one scale. "disparity": the
-        model's output is `disparity`, right up to scale and shift; depth is its inverse under the
-        assumption that the shift is 0, so compare with truth by aligning `disparity` with 1 / z.
-    disparity: H x W float32, >= 0, only for quantity "disparity".
+
+ArrayT = TypeVar("ArrayT", Tensor, np.ndarray, default=Tensor)
+
+
+@dataclass(frozen=True)
+class Prediction(Generic[ArrayT]):
+    """Geometry of one image, or of a batch (every array then has a leading B).
+
+    Models and DepthStream give tensors on the model's device; StreamSession gives numpy arrays,
+    see `numpy`.
+
+    Attributes:
+        points: H x W x 3 float32, optical frame (x right, y down, z forward).
+        depth: H x W float32, z of the points; +inf where the model predicts nothing.
+        mask: H x W bool, True where the prediction is valid.
+        intrinsics: 3 x 3 float32, normalised: pixel x = (u + 0.5) / W, y = (v + 0.5) / H.
+            `camera_matrix` has them in pixels.
+        state: Goes into the next call of the same stream; None for a model without DyFN.
+        quantity: What the model predicts. "depth": depth is right up to one scale. "disparity":
+            `disparity` is right up to scale and shift; depth is its inverse under the assumption
+            that the shift is 0, so compare with truth by aligning `disparity` with 1 / z.
+        disparity: H x W float32, >= 0, only for quantity "disparity".
+        known_camera: 3 x 3 float64 in pixels, the camera matrix that was given; None when the
+            intrinsics are an estimate.
+        reset: Why the stream was reset with this frame; None when it went on, or was the first.
+        metric: Whether points and depth are in metres; else they are right up to one scale.
     """
 
-    points: Tensor
-    depth: Tensor
-    mask: Tensor
-    intrinsics: Tensor
+    points: ArrayT
+    depth: ArrayT
+    mask: ArrayT
+    intrinsics: ArrayT
     state: StreamState | None = None
     quantity: str = DEPTH
-    disparity: Tensor | None = None
+    disparity: ArrayT | None = None
+    known_camera: np.ndarray | None = None
+    reset: str | None = None
+    metric: bool = False
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """3 x 3 float64 in pixels (of one image): the given one, else the model's estimate."""
+        if self.known_camera is not None:
+            return self.known_camera
+        size = (self.depth.shape[0], self.depth.shape[1])
+        return pixel_intrinsics(_array(self.intrinsics), size)
+
+    @property
+    def valid(self) -> ArrayT:
+        """H x W bool: the mask where depth is finite and in front of the camera."""
+        return self.mask & (self.depth > 0) & (self.depth < math.inf)
+
+    @property
+    def aligned_quantity(self) -> tuple[ArrayT, ArrayT]:
+        """What scores align with truth, H x W, and where it is valid, H x W bool.
+
+        Depth; or disparity, which is valid also where its inverse is too far to be depth.
+        """
+        if self.disparity is not None:
+            return self.disparity, abs(self.disparity) < math.inf
+        return self.depth, self.valid
+
+    def numpy(self) -> Prediction[np.ndarray]:
+        """The same with numpy arrays in place of tensors."""
+        return Prediction(
+            _array(self.points),
+            _array(self.depth),
+            _array(self.mask),
+            _array(self.intrinsics),
+            self.state,
+            self.quantity,
+            None if self.disparity is None else _array(self.disparity),
+            self.known_camera,
+            self.reset,
+            self.metric,
+        )
+
+    def scaled(self, scale: float) -> Prediction[ArrayT]:
+        """The same in metres: points and depth times the metres of one unit."""
+        factor = np.float32(scale).item()
+        return replace(self, points=self.points * factor, depth=self.depth * factor, metric=True)

@@ -53,7 +53,7 @@ class Pairing(Generic[T]):
         return taken
 
     def clear(self) -> None:
-        """Forget what waits (a stream that starts anew with another clock)."""
+        """Forget what waits (a stream that was reset, with another clock)."""
         with self._lock:
             self._waiting.clear()
             self.last_stamp = None

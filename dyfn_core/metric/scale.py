@@ -70,14 +70,40 @@ class ScaleInForce:
 
     @property
     def metric(self) -> bool:
+        """Whether depth is in metres."""
         return self.map is not None
+
+    @property
+    def warning(self) -> str:
+        """What a user who configured a source must know; "" when it does what it should."""
+        if self.source == "none":
+            return ""
+        return self.problem if self.disagrees or not self.metric else ""
+
+    def described(self) -> dict[str, str]:
+        """Name and value of everything that is known, as texts."""
+        values = {
+            "unit": "metres" if self.metric else "relative",
+            "source": self.source,
+            "scale": f"{self.map.scale:.6g}" if self.map else "none",
+        }
+        if self.map and self.map.shift:
+            values["shift"] = f"{self.map.shift:.6g}"
+        values["spread"] = "unknown" if math.isnan(self.spread) else f"{self.spread:.4f}"
+        values["age"] = "unknown" if math.isnan(self.age) else f"{self.age:.3f} s"
+        values["points"] = str(self.points)
+        values["disagrees"] = str(self.disagrees).lower()
+        values["recalibrations"] = str(self.recalibrations)
+        if self.problem:
+            values["problem"] = self.problem
+        return values
 
 
 class MetricScale:
     """The scale of one stream over time.
 
     A reset of the stream begins a new unit, so it ends a calibration found from measurements;
-    a fixed scale stays, as its user said it.
+    a fixed scale stays.
     """
 
     def __init__(self, options: ScaleOptions | None = None) -> None:
@@ -85,7 +111,7 @@ class MetricScale:
         self.calibrator = ScaleCalibrator(self.options.calibration)
 
     def reset(self) -> None:
-        """The stream started anew."""
+        """The stream was reset."""
         self.calibrator.reset()
 
     def push(

@@ -1,7 +1,13 @@
 """Image -> latent -> (DyFN) -> latent -> points."""
 
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
-from dyfn_core.models.checkpoints import CheckpointError, load_model, save_model
+from dyfn_core.models.checkpoints import (
+    CheckpointError,
+    load_model,
+    model_fingerprint,
+    resolve_device,
+    save_model,
+)
 
 __all__ = [
     "AffinePoints",
@@ -9,5 +15,7 @@ __all__ = [
     "GeometryModel",
     "Latent",
     "load_model",
+    "model_fingerprint",
+    "resolve_device",
     "save_model",
 ]

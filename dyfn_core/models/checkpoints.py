@@ -9,6 +9,7 @@ Loading is strict: a key that is missing, left over or of another shape is an er
 from __future__ import annotations
 
 import difflib
+import hashlib
 import json
 import logging
 import os
@@ -73,15 +74,27 @@ class Checkpoint:
     official: bool = False
 
 
+def resolve_device(device: torch.device | str) -> torch.device:
+    """Where to run: "auto" is a GPU if there is one, else the CPU."""
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(device)
+
+
 def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> GeometryModel:
     """A trained model, in eval mode, float32.
 
-    name_or_path: "dyfn-mini" (bundled), a file, or a Hub id such as "shawlyu/DyFN" or
-    "Ruicheng/moge-vitl", optionally with "/file".
-    Raises FileNotFoundError (no such file; or no network, then saying what to download and
-    where to put it) or CheckpointError (no checkpoint, or keys that do not fit, all listed).
+    Args:
+        name_or_path: "dyfn-mini" (bundled), a file, or a Hub id such as "shawlyu/DyFN" or
+            "Ruicheng/moge-vitl", optionally with "/file".
+        device: "cpu", "cuda", "cuda:N", or "auto": a GPU if there is one.
+
+    Raises:
+        FileNotFoundError: No such file; or no network, then saying what to download and where to
+            put it.
+        CheckpointError: No checkpoint, or keys that do not fit, all listed.
     """
-    name = os.fspath(name_or_path)
+    name, device = os.fspath(name_or_path), resolve_device(device)
     if name in BUNDLED and not Path(name).exists():
         with as_file(files("dyfn_core") / "weights" / BUNDLED[name]) as path:
             if not path.exists():
@@ -123,6 +136,15 @@ def full_config(model: GeometryModel) -> dict[str, Any]:
     """The config of a model with its stabilizer; empty_model's input."""
     stabilizer = None if model.stabilizer is None else model.stabilizer.config.to_dict()
     return {**model.config, "stabilizer": stabilizer}
+
+
+def model_fingerprint(model: GeometryModel) -> str:
+    """SHA-256 of a model's configuration and weights; a different one is a different model."""
+    digest = hashlib.sha256(json.dumps(full_config(model), sort_keys=True).encode())
+    for name, value in sorted(model.state_dict().items()):
+        digest.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def load_weights(

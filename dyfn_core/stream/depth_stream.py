@@ -33,13 +33,11 @@ from dyfn_core.models.base import (
     median_disparity,
 )
 from dyfn_core.prediction import Prediction, StreamState
+from dyfn_core.stream.resets import NEW_CAMERA, NEW_SIZE, REQUESTED, TimeRules
 
 logger = logging.getLogger(__name__)
 
 SHIFT_MODES = ("filtered", "held", "per_frame")
-REQUESTED = "requested"
-NEW_SIZE = "image size changed"
-NEW_CAMERA = "camera matrix changed"
 
 
 @dataclass(frozen=True)
@@ -95,12 +93,29 @@ class StreamMemory:
     shift: MeanState | None = None
     unit: float | None = None
 
+    def reason_to_reset(
+        self, rules: TimeRules, size: tuple[int, int], stamp: float | None
+    ) -> str | None:
+        """Why a frame of this size (H, W) and stamp cannot follow the last one; None if it can."""
+        if broken := rules.broken(self.stamp, stamp):
+            return broken
+        return None if self.image_size in (None, size) else NEW_SIZE
+
+
+def same_camera(one: np.ndarray | None, other: np.ndarray | None) -> bool:
+    """Whether two camera matrices, None when unknown, are equal."""
+    if one is None or other is None:
+        return one is other
+    return bool(np.array_equal(one, other))
+
 
 class DepthStream:
     """Frames of one camera in, geometry that keeps its scale out.
 
     Causal and deterministic: a frame's output depends on the frames since the last reset only,
-    and the same frames after a reset give the same bytes.
+    and the same frames after a reset give the same bytes. The stream resets by itself when the
+    stamps break its time rules, or when the size of the images or the camera matrix changes;
+    StreamSession does that too, and adds scene cuts, metres and saved states.
 
     A known camera matrix fixes the focal and the principal point. An unknown camera's focal is a
     robust running mean. The shift is one number per stream as far as DyFN keeps the latent's
@@ -110,7 +125,19 @@ class DepthStream:
     units of the first frame's median, an unknown camera is taken for one of NOMINAL_FOV, and
     every prediction says quantity "disparity".
 
-    resets: how often the stream started anew, by reason.
+    Attributes:
+        rules: When stamps say that a frame cannot follow the one before.
+        resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
+        memory: All that the stream remembers.
+
+    Example:
+        >>> from dyfn_core.models import load_model
+        >>> stream = DepthStream(load_model("dyfn-mini"), num_tokens=24)
+        >>> image = np.full((48, 64, 3), 128, np.uint8)
+        >>> stream.push(image, stamp=0.0).depth.shape
+        torch.Size([48, 64])
+        >>> stream.push(image, stamp=60.0).reset
+        'gap between stamps'
     """
 
     def __init__(
@@ -124,15 +151,24 @@ class DepthStream:
         shift_filter: RobustMean | None = None,
         focal_filter: RobustMean | None = None,
         force_projection: bool = True,
+        rules: TimeRules | None = None,
     ) -> None:
-        """camera_matrix: 3 x 3 in pixels, None when unknown.
+        """Start a stream.
 
-        stabilize: False runs the base model on every frame by itself.
-        num_tokens: how finely to look; None for the model's default.
-        shift_mode: "filtered" (running mean), "held" (the first frame's), "per_frame";
-            None is "filtered" with DyFN and "per_frame" without.
-        force_projection: points are the depth unprojected with the intrinsics.
-        Raises ValueError for a bad camera matrix, shift_mode or num_tokens.
+        Args:
+            model: The network, shared by any number of streams.
+            camera_matrix: 3 x 3 in pixels, None when unknown.
+            stabilize: False runs the base model on every frame by itself.
+            num_tokens: Resolution inside the model; None for the model's default.
+            shift_mode: "filtered" (running mean), "held" (the first frame's), "per_frame";
+                None is "filtered" with DyFN and "per_frame" without.
+            shift_filter: How the shift follows its measurements.
+            focal_filter: How the focal of an unknown camera follows its measurements.
+            force_projection: Points are the depth unprojected with the intrinsics.
+            rules: For the stamps; None for the default TimeRules.
+
+        Raises:
+            ValueError: A bad camera matrix, shift_mode or num_tokens.
         """
         if shift_mode is not None and shift_mode not in SHIFT_MODES:
             raise ValueError(f"shift_mode {shift_mode!r} is unknown, expected one of {SHIFT_MODES}")
@@ -145,8 +181,10 @@ class DepthStream:
         self.shift_filter = shift_filter or RobustMean()
         self.focal_filter = focal_filter or RobustMean()
         self.force_projection = force_projection
+        self.rules = rules or TimeRules()
         self.resets: Counter[str] = Counter()
         self.memory = StreamMemory()
+        self._last_reset: str | None = None
         self._camera_matrix = None if camera_matrix is None else check_camera_matrix(camera_matrix)
         self._camera_size: tuple[int, int] | None = None
 
@@ -158,10 +196,7 @@ class DepthStream:
     @camera_matrix.setter
     def camera_matrix(self, camera_matrix: np.ndarray | None) -> None:
         new = None if camera_matrix is None else check_camera_matrix(camera_matrix)
-        old = self._camera_matrix
-        if (new is None and old is None) or (
-            new is not None and old is not None and np.array_equal(new, old)
-        ):
+        if same_camera(new, self._camera_matrix):
             return
         self._camera_matrix, self._camera_size = new, None
         if self.memory.frames:
@@ -170,14 +205,24 @@ class DepthStream:
     def reset(self, reason: str = REQUESTED) -> None:
         """Forget everything but the camera matrix; the next frame is a first frame."""
         self.resets[reason] += 1
-        self.memory = StreamMemory()
+        self.memory, self._last_reset = StreamMemory(), reason
 
     def push(self, image: np.ndarray | Tensor, stamp: float | None = None) -> Prediction:
-        """The next frame -> its geometry.
+        """The geometry of the next frame.
 
-        image: H x W x 3 uint8 RGB, or float 3 x H x W in 0..1. stamp: seconds.
-        An image of another size starts the stream anew. Raises TypeError or ValueError, naming
-        what was wrong, for anything else; the stream is then as it was.
+        Args:
+            image: H x W x 3 uint8 RGB, or float 3 x H x W in 0..1.
+            stamp: Seconds; None when unknown. A stamp that breaks the time rules resets the
+                stream before this frame, as an image of another size does.
+
+        Returns:
+            Tensors of the image's size on the model's device; `reset` says whether, and why, the
+            stream was reset with this frame.
+
+        Raises:
+            TypeError: Something that is no image.
+            ValueError: An image of a wrong shape or range, or a stamp that is not finite. The
+                stream is then as it was.
         """
         return push_together([self], [image], [stamp])[0]
 
@@ -190,8 +235,8 @@ class DepthStream:
             raise ValueError(f"push takes one image at a time, got a batch of {len(batch)}")
         return batch
 
-    def _make_room(self, size: tuple[int, int]) -> None:
-        """Start anew if the image size changed; a camera matrix is for one size only."""
+    def _make_room(self, size: tuple[int, int], stamp: float | None) -> None:
+        """Reset if the frame cannot follow the last; a camera matrix is for one size only."""
         if self._camera_matrix is not None and self._camera_size not in (None, size):
             logger.warning(
                 "the camera matrix is for images of %s, this one is %s: forgetting the matrix",
@@ -199,8 +244,8 @@ class DepthStream:
                 size,
             )
             self._camera_matrix = None
-        if self.memory.image_size not in (None, size):
-            self.reset(NEW_SIZE)
+        if reason := self.memory.reason_to_reset(self.rules, size, stamp):
+            self.reset(reason)
         self._camera_size = size
 
     def finish(
@@ -209,15 +254,20 @@ class DepthStream:
         state: StreamState | None,
         stamp: float | None = None,
     ) -> Prediction:
-        """The half of push after the network: a frame's affine output (batch of one), its state.
+        """The half of push after the network, for callers that run the network themselves.
 
-        For callers that run the network themselves, on batches or for several streams at once.
+        Such a caller owns DyFN's state, so only an image of another size resets the stream here.
+
+        Args:
+            affine: The frame's output, a batch of one.
+            state: DyFN's state after the frame.
+            stamp: Seconds.
         """
         if isinstance(affine, AffineDisparity):
             return self._finish_disparity(affine.disparity, state, stamp)
         valid = affine.mask > self.model.mask_threshold
         size = (valid.shape[-2], valid.shape[-1])
-        self._make_room(size)
+        self._make_room(size, None)
         samples, usable = sample(affine.points, valid)
         xyz, uv = samples[0][usable[0]], sampled_uv(*size)[usable[0]]
         memory = replace(
@@ -245,14 +295,13 @@ class DepthStream:
             state,
             self.force_projection,
         )
-        self.memory = memory
-        return first_of_batch(prediction)
+        return self._finished(prediction, memory)
 
     def _finish_disparity(
         self, disparity: Tensor, state: StreamState | None, stamp: float | None
     ) -> Prediction:
         size = (disparity.shape[-2], disparity.shape[-1])
-        self._make_room(size)
+        self._make_room(size, None)
         unit = self.memory.unit
         if unit is None:
             unit = float(median_disparity(disparity))
@@ -264,7 +313,7 @@ class DepthStream:
         prediction = from_disparity(
             disparity, disparity.new_tensor([unit]), intrinsics.to(disparity), state
         )
-        self.memory = replace(
+        memory = replace(
             self.memory,
             frames=self.memory.frames + 1,
             image_size=size,
@@ -272,7 +321,13 @@ class DepthStream:
             state=state,
             unit=unit,
         )
-        return first_of_batch(prediction)
+        return self._finished(prediction, memory)
+
+    def _finished(self, prediction: Prediction, memory: StreamMemory) -> Prediction:
+        """Remember the frame; its prediction, with all that the stream knows of it."""
+        reset = None if self.memory.frames else self._last_reset
+        self.memory = memory
+        return replace(first_of_batch(prediction), known_camera=self.camera_matrix, reset=reset)
 
     def _track_focal(self, memory: StreamMemory, xyz: np.ndarray, uv: np.ndarray) -> StreamMemory:
         found = solve_focal_shift(xyz, uv)
@@ -312,8 +367,16 @@ def push_together(
 ) -> list[Prediction]:
     """One frame of each stream in one batch; as push, but the network runs once.
 
-    Raises ValueError when the streams do not share model, num_tokens and stabilize, or the
-    images are not of one size; nothing has then been pushed.
+    Args:
+        streams: One a camera; they share model, num_tokens and stabilize.
+        images: One a stream, of one size.
+        stamps: Seconds, one a stream; None when unknown.
+
+    Returns:
+        One prediction a stream, in their order.
+
+    Raises:
+        ValueError: The streams or the images do not fit together; nothing has then been pushed.
     """
     stamps = [None] * len(streams) if stamps is None else stamps
     first = streams[0]
@@ -335,8 +398,8 @@ def push_together(
             raise ValueError(
                 f"images of one batch must be of one size, got {[tuple(f.shape) for f in frames]}"
             )
-        for stream in streams:
-            stream._make_room((frames[0].shape[-2], frames[0].shape[-1]))
+        for stream, stamp in zip(streams, stamps, strict=True):
+            stream._make_room((frames[0].shape[-2], frames[0].shape[-1]), stamp)
         state = StreamState.stack([stream.memory.state for stream in streams])
         affine, state = first.model.predict_affine(
             frames[0] if len(frames) == 1 else torch.cat(frames),

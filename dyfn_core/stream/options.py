@@ -1,119 +1,258 @@
-"""The node's parameters of the metric scale; a part of the table in parameter_table.py."""
+"""The options of a stream: one table for the library, the node's parameters and command lines."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
 
-from dyfn_ros.node.parameters.spec import RUN
-from dyfn_ros.node.parameters.spec import parameter as _parameter
+from dyfn_core.stream.resets import TimeRules
+from dyfn_core.stream.scene_cut import THRESHOLD
 
-SCALE = "Metric scale"
+STREAM, SCALE = "Stream", "Metric scale"
+SOURCES = ("none", "fixed", "reference", "camera_height")
+UNTIL_METRIC = ("withhold", "relative")
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class MetricSettings:
-    """Where metres come from and how a scale is kept: docs/metric_scale.md."""
+class Option:
+    """What is known of an option besides its default.
 
-    metric_source: str = _parameter(
+    Attributes:
+        group: Heading in manuals and help texts.
+        description: One or more sentences.
+        range: Smallest and largest value, both allowed; for numbers.
+        choices: The values allowed; for strings. Empty: any.
+        live: Whether it may change between two frames of a stream.
+    """
+
+    group: str
+    description: str
+    range: tuple[float, float] | None = None
+    choices: tuple[str, ...] = ()
+    live: bool = False
+
+    def problem(self, name: str, value: Any) -> str:
+        """Why a value is not allowed, naming the option; "" when it is."""
+        if self.choices and value not in self.choices:
+            return f"{name} is {value!r}, expected one of {self.choices}"
+        if self.range is not None:
+            low, high = self.range
+            if not low <= value <= high:
+                return f"{name} is {value}, expected {low:.10g} to {high:.10g}"
+        return ""
+
+
+def option(group: str, default: Any, description: str, **details: Any) -> Any:
+    """A dataclass field with an Option."""
+    return field(default=default, metadata={"option": Option(group, description, **details)})
+
+
+def options_of(kind: type) -> dict[str, Option]:
+    """The options among the fields of a dataclass, by name, in their order."""
+    return {f.name: f.metadata["option"] for f in fields(kind) if "option" in f.metadata}
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """How one camera's stream runs; the same names and defaults everywhere.
+
+    The node's parameters, dyfn-replay's options and StreamSession all come from these fields; see
+    docs/node.md for the table. Raises ValueError, naming option, value and what was expected, for
+    a value that is not allowed.
+
+    Example:
+        >>> StreamOptions(metric_source="fixed", metric_scale=2.0).max_gap
+        5.0
+        >>> StreamOptions(max_gap=-1.0)
+        Traceback (most recent call last):
+        ValueError: max_gap is -1.0, expected 0 to 1000000
+    """
+
+    stabilize: bool = option(STREAM, True, "Use DyFN. A change resets the stream.", live=True)
+    num_tokens: int = option(
+        STREAM,
+        0,
+        "Resolution inside the model; 0 is the model's own. A change resets the stream.",
+        range=(0, 100_000),
+        live=True,
+    )
+    stamp_tolerance: float = option(
+        STREAM,
+        TimeRules.tolerance,
+        "Seconds that a stamp (or ROS time) may go back before the stream resets.",
+        range=(0.0, 1e6),
+        live=True,
+    )
+    max_gap: float = option(
+        STREAM,
+        TimeRules.max_gap,
+        "Seconds from one frame's stamp to the next (or a jump of ROS time) beyond which the "
+        "stream resets; 0 is no limit.",
+        range=(0.0, 1e6),
+        live=True,
+    )
+    scene_cut_threshold: float = option(
+        STREAM,
+        THRESHOLD,
+        "Difference between consecutive images beyond which the camera is somewhere else and the "
+        "stream resets; 0 switches it off. See docs/metric_scale.md.",
+        range=(0.0, 2.0),
+        live=True,
+    )
+    state_file: str = option(
+        STREAM,
+        "",
+        "File that the stream's state is saved to and loaded from (the node: by ~/save_state and "
+        "~/load_state; several cameras that share it put their name before the suffix).",
+        live=True,
+    )
+    metric_source: str = option(
         SCALE,
         "none",
         "Where metres come from. none: depth is relative. fixed: metric_scale. reference: "
         "measurements on `reference`. camera_height: over the ground.",
-        per_camera=True,
-        choices=("none", "fixed", "reference", "camera_height"),
+        choices=SOURCES,
     )
-    metric_scale: float = _parameter(
+    metric_scale: float = option(
         SCALE,
         1.0,
         "fixed: metres in one unit of the model's depth.",
-        changes=RUN,
-        per_camera=True,
         range=(1e-6, 1e6),
+        live=True,
     )
-    until_metric: str = _parameter(
+    until_metric: str = option(
         SCALE,
         "withhold",
         "Before a configured source has given a scale. withhold: everything is NaN. relative: "
         "depth up to scale, so that the topic's unit changes later.",
-        changes=RUN,
-        per_camera=True,
-        choices=("withhold", "relative"),
+        choices=UNTIL_METRIC,
+        live=True,
     )
-    reference_type: str = _parameter(
-        SCALE,
-        "PointCloud2",
-        "Type of the topic `reference`. An Image is depth registered to the camera.",
-        per_camera=True,
-        choices=("Image", "PointCloud2", "LaserScan", "Range"),
-    )
-    reference_transform: str = _parameter(
-        SCALE,
-        "",
-        "Pose of the sensor in the camera's optical frame, 'x y z qx qy qz qw'. Empty: at the "
-        "camera, x forward for LaserScan and Range, optical axes for PointCloud2.",
-        per_camera=True,
-    )
-    reference_tolerance: float = _parameter(
+    reference_tolerance: float = option(
         SCALE,
         0.1,
         "Seconds between the stamps of a measurement and of the image it is compared with.",
-        per_camera=True,
         range=(1e-3, 10.0),
     )
-    camera_height: float = _parameter(
+    camera_height: float = option(
         SCALE,
         0.0,
         "camera_height: metres from the ground to the camera's centre.",
-        per_camera=True,
         range=(0.0, 1000.0),
     )
-    camera_pitch: float = _parameter(
+    camera_pitch: float = option(
         SCALE,
         0.0,
         "camera_height: degrees that the camera looks down.",
-        per_camera=True,
         range=(-90.0, 90.0),
     )
-    calibration: str = _parameter(
+    calibration: str = option(
         SCALE,
         "hold",
-        "hold: the first calibration stays until the stream starts anew. track: follow slowly.",
-        per_camera=True,
+        "hold: the first calibration stays until the stream resets. track: follow slowly.",
         choices=("hold", "track"),
     )
-    calibration_fit: str = _parameter(
+    calibration_fit: str = option(
         SCALE,
         "scale",
-        "What is fitted: the shift along the depth is known already, except to some models.",
-        per_camera=True,
+        "Fitted quantity: scale, or scale and shift (for models whose shift is unknown).",
         choices=("scale", "scale_shift"),
     )
-    calibration_seconds: float = _parameter(
-        SCALE,
-        1.0,
-        "Seconds of measurements that a fit is made on.",
-        per_camera=True,
-        range=(0.01, 600.0),
+    calibration_seconds: float = option(
+        SCALE, 1.0, "Seconds of measurements that a fit is made on.", range=(0.01, 600.0)
     )
-    calibration_points: int = _parameter(
+    calibration_points: int = option(
         SCALE,
         10,
         "Fewest points of a fit; a Range message or a frame's ground plane is one point.",
-        per_camera=True,
         range=(2, 100_000),
     )
-    tracking_rate: float = _parameter(
-        SCALE,
-        0.05,
-        "track: fastest change of the scale, a share a second.",
-        per_camera=True,
-        range=(1e-4, 10.0),
+    tracking_rate: float = option(
+        SCALE, 0.05, "track: fastest change of the scale, a share a second.", range=(1e-4, 10.0)
     )
-    reference_disagreement: float = _parameter(
+    reference_disagreement: float = option(
         SCALE,
         0.25,
         "Measurements that differ by more from the scale in force (natural logarithm) for 3 s "
         "contradict it: a warning, and with track a new calibration.",
-        per_camera=True,
         range=(0.01, 10.0),
     )
+
+    def __post_init__(self) -> None:
+        for name, described in options_of(StreamOptions).items():
+            if problem := described.problem(name, getattr(self, name)):
+                raise ValueError(problem)
+
+    @property
+    def time_rules(self) -> TimeRules:
+        """When the stamps of two frames say that the stream must be reset."""
+        return TimeRules(self.stamp_tolerance, self.max_gap)
+
+
+def add_options(parser: argparse.ArgumentParser, kind: type = StreamOptions) -> None:
+    """Give a parser the options of a dataclass: `--max-gap` for max_gap, one group a heading.
+
+    Args:
+        parser: Gets one argument group for each heading.
+        kind: A dataclass whose fields were made by `option`, with a default each.
+
+    Example:
+        >>> parser = argparse.ArgumentParser()
+        >>> add_options(parser)
+        >>> options_from(parser.parse_args(["--max-gap", "3"])).max_gap
+        3.0
+    """
+    groups: dict[str, Any] = {}
+    defaults = kind()
+    for name, described in options_of(kind).items():
+        group = groups.get(described.group)
+        if group is None:
+            group = groups[described.group] = parser.add_argument_group(described.group)
+        default = getattr(defaults, name)
+        flag = f"--{name.replace('_', '-')}"
+        text = described.description.replace("%", "%%")
+        if isinstance(default, bool):
+            group.add_argument(
+                flag, action=argparse.BooleanOptionalAction, default=default, help=text
+            )
+            continue
+        shown = default if default != "" else "none"
+        group.add_argument(
+            flag,
+            type=_parsed(name, described, type(default)),
+            default=default,
+            choices=described.choices or None,
+            metavar=None if described.choices else type(default).__name__.upper(),
+            help=f"{text} (default: {shown})",
+        )
+
+
+def options_from(
+    arguments: argparse.Namespace | Mapping[str, Any],
+    kind: type[T] = StreamOptions,  # type: ignore[assignment]
+) -> T:
+    """The dataclass that parsed arguments describe; other arguments are left alone.
+
+    Raises:
+        ValueError: A value is not allowed.
+    """
+    values = arguments if isinstance(arguments, Mapping) else vars(arguments)
+    return kind(**{name: values[name] for name in options_of(kind)})
+
+
+def _parsed(name: str, described: Option, kind: type) -> Callable[[str], Any]:
+    def parse(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what}") from None
+        if described.range is not None and (problem := described.problem(name, value)):
+            raise argparse.ArgumentTypeError(problem)
+        return value
+
+    return parse

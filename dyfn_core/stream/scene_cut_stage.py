@@ -1,40 +1,38 @@
-"""Scene cuts start a camera's stream anew."""
+"""The stage that resets a stream at scene cuts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from dyfn_core.stream.session import StreamFrame, StreamHook
-
-if TYPE_CHECKING:
-    from dyfn_core.stream.scene_cut import CutState
-
-SCENE_CUT = "scene cut"
+from dyfn_core.prediction import Frame
+from dyfn_core.stream.resets import SCENE_CUT
+from dyfn_core.stream.scene_cut import CutState, SceneCutDetector
+from dyfn_core.stream.stages import StreamStage
 
 
-class SceneCutHook(StreamHook):
-    """threshold: asked for at each frame; 0 switches it off."""
+class SceneCutStage(StreamStage):
+    """Compares consecutive images before the network sees them."""
+
+    saved_as = "cut"
 
     def __init__(self, threshold: Callable[[], float]) -> None:
-        from dyfn_core.stream.scene_cut import SceneCutDetector
-
+        """threshold: Asked for at each frame; 0 switches the stage off."""
         self._threshold = threshold
         self._detector = SceneCutDetector()
 
     @property
     def state(self) -> CutState:
-        """What the detector remembers."""
+        """See StreamStage."""
         return self._detector.state
 
     def restore(self, state: CutState | None) -> None:
-        """Go on from a remembered state; None starts anew."""
+        """See StreamStage."""
         self._detector.reset()
         if state is not None:
             self._detector.state = state
 
-    def before_frame(self, frame: StreamFrame) -> str | None:
-        """See StreamHook."""
+    def before_frame(self, frame: Frame) -> str | None:
+        """See StreamStage."""
         threshold = self._threshold()
         if not threshold:
             self._detector.reset()
@@ -43,7 +41,7 @@ class SceneCutHook(StreamHook):
         return SCENE_CUT if self._detector.push(frame.image) else None
 
     def report(self) -> dict[str, str]:
-        """See StreamHook."""
+        """See StreamStage."""
         if not self._threshold():
             return {"scene cut": "off"}
         return {"scene cut": f"difference {self._detector.difference:.3f} of {self._threshold()}"}

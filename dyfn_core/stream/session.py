@@ -1,272 +1,301 @@
-"""One camera's frames through a DepthStream that starts anew when what it depends on changes."""
+"""StreamSession: one camera's frames in, geometry out, with everything that a stream can do."""
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyfn_core.geometry.camera import pixel_intrinsics, valid_depth
+from dyfn_core.prediction import DISPARITY, Frame, Prediction
+from dyfn_core.stream.depth_stream import DepthStream, same_camera
+from dyfn_core.stream.metric_stage import MetricStage
+from dyfn_core.stream.options import StreamOptions, options_of
+from dyfn_core.stream.resets import (
+    FAILED,
+    NEW_CAMERA,
+    NEW_FRAME_ID,
+    NEW_SETTINGS,
+    REQUESTED,
+)
+from dyfn_core.stream.saving import Loaded, StateKeeper, StreamSettings
+from dyfn_core.stream.scene_cut_stage import SceneCutStage
+from dyfn_core.stream.stages import StreamStage
 
 if TYPE_CHECKING:
+    from dyfn_core.metric.references import Reference
+    from dyfn_core.metric.scale import ScaleInForce
     from dyfn_core.models.base import GeometryModel
-    from dyfn_core.prediction import Prediction
-    from dyfn_core.stream.depth_stream import DepthStream
-
-REQUESTED = "reset service"
-TIME_JUMP = "ROS time jumped"
-BACKWARDS = "stamp went back"
-GAP = "gap between stamps"
-NEW_SIZE = "image size changed"
-NEW_FRAME_ID = "frame_id changed"
-NEW_CAMERA = "intrinsics changed"
-NEW_SETTINGS = "settings changed"
-FAILED = "inference failed"
 
 
 @dataclass(frozen=True)
-class StreamKey:
-    """What a stream is made for; another key is another stream.
+class ResetRequest:
+    """The resets that were asked for up to some moment: how many, and why the last one."""
 
-    size: (H, W). camera_matrix: the nine intrinsics in pixels, None when unknown.
-    num_tokens: 0 for the model's own.
+    count: int = 0
+    reason: str = REQUESTED
+
+
+class StreamSession:
+    """One camera over time: what the node, dyfn-replay and the benchmarks run.
+
+    A frame passes, in this order: a state that was loaded takes the stream's place; the rules
+    decide whether the stream must be reset (a failed frame, a request, another frame_id, stamps,
+    image size, camera matrix, settings, then the stages: scene cuts); the network and DyFN; the
+    stages again, in their order: metres, and what the caller adds. The first rule that applies
+    gives the reason of a reset. A reset ends the memory of the stream and of its stages.
+
+    One thread pushes frames and sets `options`. `add_reference`, `request_reset`, `save`, `load`,
+    `report` and `problems` may be called by others.
+
+    Attributes:
+        model: The network, shared by any number of sessions.
+        stages: Scene cuts, metric scale, and those that were given, in this order.
+        resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
+        stream: What holds the memory; None before the first frame and after a failed one.
+
+    Example:
+        >>> from dyfn_core.models import load_model
+        >>> options = StreamOptions(metric_source="fixed", metric_scale=2.5, num_tokens=24)
+        >>> session = StreamSession(load_model("dyfn-mini"), options)
+        >>> image = np.full((48, 64, 3), 128, np.uint8)
+        >>> found = session.push(Frame(image, stamp=0.0))
+        >>> found.depth.shape, found.metric, found.camera_matrix.shape
+        ((48, 64), True, (3, 3))
+        >>> session.push(Frame(image, stamp=60.0)).reset
+        'gap between stamps'
     """
 
-    size: tuple[int, int]
-    camera_matrix: tuple[float, ...] | None
-    stabilize: bool
-    num_tokens: int
-    frame_id: str = ""
+    def __init__(
+        self,
+        model: GeometryModel,
+        options: StreamOptions | None = None,
+        stages: Sequence[StreamStage] = (),
+    ) -> None:
+        """Start a session without frames.
 
-    def difference(self, other: StreamKey) -> str | None:
-        """The reason to start anew when `other` came before; None when they are equal."""
-        if self.size != other.size:
-            return NEW_SIZE
-        if self.frame_id != other.frame_id:
-            return NEW_FRAME_ID
-        if self.camera_matrix != other.camera_matrix:
-            return NEW_CAMERA
-        return None if self == other else NEW_SETTINGS
+        Args:
+            model: The network.
+            options: None for the defaults.
+            stages: Of the caller's own; they come after scene cuts and metric scale.
 
-
-@dataclass(frozen=True)
-class StreamFrame:
-    """One image on its way through a stream.
-
-    image: H x W x 3 uint8 RGB. camera_matrix: 3 x 3 pixels or None. stamp: seconds.
-    visible: H x W bool, where there is a picture; None: everywhere.
-    epoch: the number of resets that were asked for before the frame; request: why, for the last.
-    """
-
-    image: np.ndarray
-    camera_matrix: np.ndarray | None = None
-    visible: np.ndarray | None = None
-    stamp: float | None = None
-    frame_id: str = ""
-    stabilize: bool = True
-    num_tokens: int = 0
-    epoch: int = 0
-    request: str = REQUESTED
+        Raises:
+            ValueError: An option that is not allowed, or metres of a model that predicts
+                disparity.
+        """
+        self.model = model
+        self._options = options = options or StreamOptions()
+        if model.quantity == DISPARITY and options.metric_source != "none":
+            raise ValueError(
+                f"metric_source is {options.metric_source!r}, but the model predicts disparity, "
+                "whose unknown shift no metric scale undoes; expected 'none'"
+            )
+        self._metric = MetricStage(lambda: self._options)
+        cuts = SceneCutStage(lambda: self._options.scene_cut_threshold)
+        self.stages: tuple[StreamStage, ...] = (cuts, self._metric, *stages)
+        self.resets: Counter[str] = Counter()
+        self.stream: DepthStream | None = None
+        self.asked = ResetRequest()
+        self._keeper = StateKeeper(self.stages, model)
+        self._done = ResetRequest()  # what was asked for before the last frame
+        self._settings = self._settings_with("")
+        self._failed = False
+        self._loaded: tuple[ResetRequest, Loaded] | None = None  # for the frame after the request
+        self._lock = threading.Lock()
 
     @property
-    def key(self) -> StreamKey:
-        """What its stream must be made for."""
-        matrix = self.camera_matrix
-        numbers = None if matrix is None else tuple(matrix.reshape(-1).tolist())
-        size = (self.image.shape[0], self.image.shape[1])
-        return StreamKey(size, numbers, self.stabilize, self.num_tokens, self.frame_id)
+    def options(self) -> StreamOptions:
+        """The options in force."""
+        return self._options
 
-
-@dataclass(frozen=True)
-class Geometry:
-    """Arrays of one frame, at its resolution.
-
-    points: H x W x 3 float32. depth: H x W float32. valid: H x W bool.
-    camera_matrix: 3 x 3 float64, pixels: the given one, else the model's estimate.
-    reset: why the stream started anew with this frame; None when it went on (or was the first).
-    metric: whether points and depth are in metres; else they are right up to one scale.
-    disparity: H x W float32, what a disparity model said: right up to scale and shift, and depth
-        is its inverse only as far as that shift is 0. None for other models.
-    """
-
-    points: np.ndarray
-    depth: np.ndarray
-    valid: np.ndarray
-    camera_matrix: np.ndarray
-    reset: str | None = None
-    metric: bool = False
-    disparity: np.ndarray | None = None
+    @options.setter
+    def options(self, options: StreamOptions) -> None:
+        for name, described in options_of(StreamOptions).items():
+            old, new = getattr(self._options, name), getattr(options, name)
+            if old != new and not described.live:
+                raise ValueError(f"{name} is {old!r} for the whole session, it cannot be {new!r}")
+        self._options = options
 
     @property
-    def said(self) -> tuple[np.ndarray, np.ndarray]:
-        """What is aligned to truth, H x W, and where it is valid: depth; or disparity, also where
-        its inverse is too far to be depth."""
-        if self.disparity is not None:
-            return self.disparity, np.isfinite(self.disparity)
-        return self.depth, self.valid
+    def scale(self) -> ScaleInForce:
+        """What the depth of the last frame means."""
+        return self._metric.scale
 
-    def scaled(self, scale: float) -> Geometry:
-        """The same in metres: points and depth times the metres of one unit."""
-        factor = np.float32(scale)
-        return replace(self, points=self.points * factor, depth=self.depth * factor, metric=True)
+    # Any thread.
 
+    def add_reference(self, stamp: float, reference: Reference) -> None:
+        """A measurement for metric_source "reference".
 
-class StreamHook:
-    """Something that watches a stream or changes its output; the base does nothing.
+        Args:
+            stamp: Seconds, on the clock of the frames. The measurement is compared with the frame
+                within `reference_tolerance` of it that is pushed next.
+            reference: A PointReference, DepthReference or ConeReference, in the optical frame.
+        """
+        self._metric.add_reference(stamp, reference)
 
-    All methods run in the inference thread, in the frames' order.
-    """
+    def request_reset(self, reason: str = REQUESTED) -> ResetRequest:
+        """Reset the stream with the next frame.
 
-    def before_frame(self, frame: StreamFrame) -> str | None:
-        """A reason to start the stream anew with this frame, or None. Only causal knowledge."""
-        return None
+        Returns:
+            What to push frames with that come from now on. Frames that came before may still be
+            pushed, with the value of `asked` from when they came: they see the old memory.
+        """
+        with self._lock:
+            self.asked = ResetRequest(self.asked.count + 1, reason)
+            return self.asked
 
-    def started(self, reason: str | None) -> None:
-        """The stream starts with the coming frame; reason None is the very first one."""
+    def save(self, path: str | None = None) -> str:
+        """Write the state after the last frame to a file; an older file is kept when that fails.
 
-    def after_prediction(self, frame: StreamFrame, geometry: Geometry) -> Geometry:
-        """What to publish instead of the geometry."""
-        return geometry
+        Args:
+            path: None for the option state_file.
 
-    def adopt(self, frame: StreamFrame) -> tuple[StreamKey, DepthStream, int] | None:
-        """A stream to go on with from this frame, its key and epoch, instead of the own one."""
-        return None
+        Returns:
+            A line that says what was saved.
+
+        Raises:
+            StateError: There is nothing to save, or the file cannot be written.
+        """
+        return self._keeper.save(self._options.state_file if path is None else path)
+
+    def load(self, path: str | None = None) -> str:
+        """Go on from a state file with the next frame that is pushed.
+
+        Args:
+            path: None for the option state_file.
+
+        Returns:
+            A line that says what was loaded.
+
+        Raises:
+            StateError: A file that cannot be read, is damaged, belongs to another model or to
+                other options, or does not fit the camera. The session is then as it was.
+        """
+        path = self._options.state_file if path is None else path
+        loaded = self._keeper.load(path, self._options)
+        with self._lock:
+            asked = ResetRequest(self.asked.count + 1)
+            self._loaded = (asked, loaded)
+            self.asked = asked
+        return f"goes on after {loaded.saved.memory.frames} frames from {path}"
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the model, which a state file names; found on first use (seconds)."""
+        return self._keeper.fingerprint
 
     def report(self) -> dict[str, str]:
-        """For diagnostics, any thread: name and value."""
-        return {}
+        """Name and value of what the stages know, and the model's fingerprint."""
+        found: dict[str, str] = {}
+        for stage in self.stages:
+            found.update(stage.report())
+        return {**found, "model fingerprint": self.fingerprint[:12]}
 
     def problems(self) -> list[str]:
-        """For diagnostics, any thread: what a user should look at."""
-        return []
+        """What a user should look at."""
+        return [problem for stage in self.stages for problem in stage.problems()]
 
+    # The thread that pushes frames.
 
-@dataclass(frozen=True)
-class TimeRules:
-    """When stamps say that the past is over.
+    def push(self, frame: Frame, asked: ResetRequest | None = None) -> Prediction[np.ndarray]:
+        """The geometry of the next frame.
 
-    tolerance: seconds that a stamp may go back. max_gap: seconds between frames; 0 is no limit.
-    """
+        Args:
+            frame: Its camera_matrix is used for this frame; a different one resets the stream.
+            asked: What `asked` was when the frame came; None when it comes now.
 
-    tolerance: float = 0.2
-    max_gap: float = 5.0
+        Returns:
+            Arrays of the image's size. `metric` says whether they are in metres, `reset` whether
+            and why the stream was reset with this frame.
 
-    def broken(self, before: float | None, now: float | None) -> str | None:
-        """The reason to start anew, or None."""
-        if before is None or now is None:
-            return None
-        if now < before - self.tolerance:
-            return BACKWARDS
-        return GAP if self.max_gap and now > before + self.max_gap else None
-
-
-StreamMaker = Callable[[StreamKey], "DepthStream"]
-
-
-def stream_maker(model: GeometryModel) -> StreamMaker:
-    """The one way in which streams are made, live and offline."""
-    from dyfn_core.stream.depth_stream import DepthStream
-
-    def make(key: StreamKey) -> DepthStream:
-        matrix = key.camera_matrix
-        return DepthStream(
-            model,
-            camera_matrix=None if matrix is None else np.array(matrix).reshape(3, 3),
-            stabilize=key.stabilize,
-            num_tokens=key.num_tokens or None,
-        )
-
-    return make
-
-
-@dataclass
-class StreamSession:
-    """Not for several threads at once: the inference thread owns it.
-
-    resets: how often the stream started anew, by reason.
-    """
-
-    make: StreamMaker
-    rules: TimeRules = field(default_factory=TimeRules)
-    hooks: Sequence[StreamHook] = ()
-
-    def __post_init__(self) -> None:
-        self.resets: Counter[str] = Counter()
-        self.stream: Any = None  # a DepthStream; its `memory` is all that it remembers
-        self._key: StreamKey | None = None
-        self._epoch = 0
-        self._stamp: float | None = None
-        self._failed = False
-        self._reset: str | None = None
-
-    def push(self, frame: StreamFrame) -> Geometry:
-        """begin, the network, end. An exception goes to the caller; the stream starts anew."""
-        stream = self.begin(frame)
+        Raises:
+            TypeError, ValueError: A bad image, stamp or camera matrix. The stream resets with the
+                next frame.
+        """
         try:
-            prediction = stream.push(frame.image, frame.stamp)
+            stream = self.begin(frame, asked)
+            return self.end(frame, stream.push(frame.image, frame.stamp))
         except BaseException:
             self.fail()
             raise
-        return self.end(frame, prediction)
 
-    def begin(self, frame: StreamFrame) -> DepthStream:
-        """The stream that this frame goes into, started anew if it must be."""
-        for hook in self.hooks:
-            if (adopted := hook.adopt(frame)) is not None:
-                self._key, self.stream, self._epoch = adopted
-                self._stamp, self._failed = None, False  # time went by, that is no gap
+    def begin(self, frame: Frame, asked: ResetRequest | None = None) -> DepthStream:
+        """The half of push before the network, for callers that run several cameras in a batch.
+
+        Returns:
+            The stream that the frame goes into (see push_together), reset if it must be. `end`
+            follows, or `fail`.
+        """
+        asked = self.asked if asked is None else asked
+        self._adopt(asked)
         first = self.stream is None and not self._failed
-        reason = None if first else self._reason(frame)
-        for hook in self.hooks:
-            found = hook.before_frame(frame)
+        reason = None if first else self._reason(frame, asked)
+        for stage in self.stages:
+            found = stage.before_frame(frame)
             reason = reason or (None if first else found)
-        key = frame.key
-        if self.stream is None or key != self._key:
-            self.stream = self.make(key)
-        elif reason:
-            self.stream.reset(reason)
-        if reason:
-            self.resets[reason] += 1
-        if first or reason:
-            for hook in self.hooks:
-                hook.started(reason)
-        self._key, self._epoch, self._stamp = key, frame.epoch, frame.stamp
-        self._failed, self._reset = False, reason
+        if self.stream is None or reason:
+            self.stream = self._start(frame, reason)
+        self.stream.rules = self._options.time_rules
+        self._done, self._settings = asked, self._settings_with(frame.frame_id)
+        self._failed = False
         return self.stream
 
-    def _reason(self, frame: StreamFrame) -> str | None:
-        if self._failed:
-            return FAILED
-        if frame.epoch != self._epoch:
-            return frame.request
-        assert self._key is not None
-        return self.rules.broken(self._stamp, frame.stamp) or frame.key.difference(self._key)
-
-    def end(self, frame: StreamFrame, prediction: Prediction) -> Geometry:
-        """The prediction of a begun frame -> its geometry, as arrays."""
-        geometry = _geometry(prediction, frame, self._reset)
-        for hook in self.hooks:
-            geometry = hook.after_prediction(frame, geometry)
-        return geometry
+    def end(self, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
+        """The half of push after the network: the prediction of a begun frame, as arrays."""
+        found = prediction.numpy()
+        valid = found.valid if frame.visible is None else found.valid & frame.visible
+        found = replace(found, mask=valid, known_camera=frame.camera_matrix)
+        for stage in self.stages:
+            found = stage.after_prediction(frame, found)
+        assert self.stream is not None
+        self._keeper.remember(self._settings, self.stream)
+        return found
 
     def fail(self) -> None:
-        """The begun frame could not be worked on: the next one starts anew."""
+        """The begun frame could not be worked on: the stream resets with the next one."""
         self.stream, self._failed = None, True
 
+    def _adopt(self, asked: ResetRequest) -> None:
+        """Let a loaded state take the stream's place, unless the frame came before it."""
+        with self._lock:
+            if self._loaded is None or asked.count < self._loaded[0].count:
+                return
+            (self._done, loaded), self._loaded = self._loaded, None
+        self.stream, self._failed = loaded.stream, False
+        self.stream.resets = self.resets
+        self._settings = loaded.settings
+        for stage in self.stages:
+            if stage.saved_as:
+                stage.restore(getattr(loaded.saved, stage.saved_as))
 
-def _geometry(prediction: Prediction, frame: StreamFrame, reset: str | None) -> Geometry:
-    depth = prediction.depth.cpu().numpy()
-    valid = valid_depth(depth, prediction.mask.cpu().numpy())
-    if frame.visible is not None:
-        valid &= frame.visible
-    matrix = frame.camera_matrix
-    if matrix is None:
-        matrix = pixel_intrinsics(
-            prediction.intrinsics.cpu().numpy(), (depth.shape[0], depth.shape[1])
-        )
-    disparity = None if prediction.disparity is None else prediction.disparity.cpu().numpy()
-    points = prediction.points.cpu().numpy()
-    return Geometry(points, depth, valid, matrix, reset, disparity=disparity)
+    def _reason(self, frame: Frame, asked: ResetRequest) -> str | None:
+        """The first rule, those of the stages apart, by which this frame resets the stream."""
+        if self.stream is None:
+            return FAILED
+        if asked.count != self._done.count:
+            return asked.reason
+        memory, now = self.stream.memory, self._settings_with(frame.frame_id)
+        if reason := memory.reason_to_reset(self._options.time_rules, frame.size, frame.stamp):
+            return reason
+        if frame.frame_id != self._settings.frame_id:
+            return NEW_FRAME_ID
+        if not same_camera(self.stream.camera_matrix, frame.camera_matrix):
+            return NEW_CAMERA
+        return None if now == self._settings else NEW_SETTINGS
+
+    def _settings_with(self, frame_id: str) -> StreamSettings:
+        return StreamSettings(self._options.stabilize, self._options.num_tokens, frame_id)
+
+    def _start(self, frame: Frame, reason: str | None) -> DepthStream:
+        """A stream without memory; the reason of the reset is counted."""
+        settings = self._settings_with(frame.frame_id)
+        stream = settings.stream(self.model, frame.camera_matrix)
+        stream.resets = self.resets
+        if reason:
+            stream.reset(reason)
+        for stage in self.stages:
+            stage.started(reason)
+        return stream

@@ -20,8 +20,6 @@ from torch import Tensor
 from dyfn_core.metric.calibration import ScaleCalibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
-from dyfn_core.models.base import GeometryModel
-from dyfn_core.models.checkpoints import full_config
 from dyfn_core.prediction import StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, StreamMemory
 from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
@@ -67,15 +65,6 @@ _KINDS: dict[str, type] = {
 }
 
 
-def model_fingerprint(model: GeometryModel) -> str:
-    """SHA-256 of a model's configuration and weights; a different one is a different model."""
-    digest = hashlib.sha256(json.dumps(full_config(model), sort_keys=True).encode())
-    for name, value in sorted(model.state_dict().items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
 def stream_options(stream: DepthStream) -> dict[str, Any]:
     """What two streams must share for one to go on with the memory of the other."""
     filters = {"shift_filter": stream.shift_filter, "focal_filter": stream.focal_filter}
@@ -99,7 +88,7 @@ def save_stream(
 ) -> None:
     """Write a stream's state, whole or not at all: a file of that name stays until it is.
 
-    fingerprint: model_fingerprint of the stream's model.
+    fingerprint: of the stream's model, see dyfn_core.models.checkpoints.model_fingerprint.
     Raises OSError (no such folder, disk full); the old file is then as it was.
     """
     saved = SavedStream(
@@ -183,7 +172,8 @@ def restore(stream: DepthStream, saved: SavedStream) -> None:
     stream.camera_matrix = saved.camera_matrix
     state = saved.memory.state
     state = None if state is None else state.to(stream.model.device)
-    stream.memory = replace(saved.memory, state=state)
+    # The time between saving and loading is no gap between two frames.
+    stream.memory = replace(saved.memory, state=state, stamp=None)
 
 
 def _metadata(data: bytes) -> dict[str, str]:

@@ -108,7 +108,7 @@ class LivePlayer:
         raise LiveError(f"{self._name}: no frame came back within {START_PATIENCE:.0f} s")
 
     def reset(self, stabilize: bool) -> None:
-        """Choose DyFN on or off, then start the stream anew by the reset service."""
+        """Choose DyFN on or off, then reset the stream by the reset service."""
         wanted = Parameter("stabilize", value=stabilize).to_parameter_msg()
         request = SetParameters.Request(parameters=[wanted])
         for result in self._call(SetParameters, "set_parameters", request).results:

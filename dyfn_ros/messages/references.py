@@ -6,23 +6,48 @@ Reads any object with the fields of the ROS type, as messages.py does.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from dyfn_core.metric.references import (
+    ConeReference,
+    DepthReference,
+    DepthView,
+    Evidence,
+    PointReference,
+    Reference,
+)
+from dyfn_core.stream.options import SCALE, option
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.images import MessageError
-
-if TYPE_CHECKING:
-    from dyfn_core.metric.references import Reference
 
 REFERENCE_TYPES = ("Image", "PointCloud2", "LaserScan", "Range")
 ULTRASOUND = 0  # sensor_msgs/Range.radiation_type
 _FORMATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField: FLOAT32, FLOAT64
 # REP 103: a body frame (x forward, y left, z up) seen from an optical one at the same place.
 _BODY_TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+@dataclass(frozen=True)
+class ReferenceOptions:
+    """What the topic of metric_source "reference" holds; for the node and dyfn-replay."""
+
+    reference_type: str = option(
+        SCALE,
+        "PointCloud2",
+        "Type of the topic `reference`. An Image is depth registered to the camera.",
+        choices=REFERENCE_TYPES,
+    )
+    reference_transform: str = option(
+        SCALE,
+        "",
+        "Pose of the sensor in the camera's optical frame, 'x y z qx qy qz qw'. Empty: at the "
+        "camera, x forward for LaserScan and Range, optical axes for PointCloud2.",
+    )
 
 
 @dataclass(frozen=True)
@@ -149,7 +174,6 @@ def decode_range(message: Any) -> tuple[float, float, bool]:
 
 def reference_decoder(kind: str, transform: Transform) -> Callable[[Any], Reference]:
     """The function that makes a measurement of a message of this type; raises MessageError."""
-    from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
 
     def cone(message: Any) -> Reference:
         distance, half_angle, sound = decode_range(message)
@@ -163,3 +187,42 @@ def reference_decoder(kind: str, transform: Transform) -> Callable[[Any], Refere
         "Range": cone,
     }
     return decoders[kind]
+
+
+@dataclass(frozen=True)
+class MessageReference:
+    """A measurement that is decoded when a frame is compared with it.
+
+    So a message that never meets a frame costs nothing. One that cannot be read counts as
+    "not decodable", and `warn` takes the reason.
+    """
+
+    message: Any
+    decode: Callable[[Any], Reference]
+    warn: Callable[[str], None]
+
+    def evidence(self, view: DepthView, stamp: float) -> Evidence:
+        """See dyfn_core.metric.references.Reference."""
+        try:
+            reference = self.decode(self.message)
+        except MessageError as error:
+            self.warn(str(error))
+            return Evidence(stamp, np.empty(0), np.empty(0), Counter({"not decodable": 1}))
+        return reference.evidence(view, stamp)
+
+
+def message_references(
+    options: ReferenceOptions, warn: Callable[[str], None]
+) -> Callable[[Any], MessageReference]:
+    """The function that makes a measurement of a message, for StreamSession.add_reference.
+
+    Args:
+        options: Type of the messages, and where the sensor is.
+        warn: Takes the reason why a message cannot be read.
+
+    Raises:
+        ValueError: reference_type or reference_transform is not usable; the text names it.
+    """
+    kind = options.reference_type
+    decode = reference_decoder(kind, parse_transform(options.reference_transform, kind))
+    return lambda message: MessageReference(message, decode, warn)

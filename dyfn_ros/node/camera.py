@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from dyfn_core.stream.scene_cut_hook import SceneCutHook
-from dyfn_core.stream.session import (
-    REQUESTED,
-    Geometry,
-    StreamFrame,
-    StreamHook,
-    StreamSession,
-    TimeRules,
-    stream_maker,
-)
-from dyfn_core.stream.state_hook import StateError, StateHook, path_for
+from dyfn_core.prediction import Frame, Prediction
+from dyfn_core.stream.depth_stream import DepthStream
+from dyfn_core.stream.saving import StateError, path_for
+from dyfn_core.stream.session import ResetRequest, StreamSession
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.images import MessageError, decode_image
-from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
-from dyfn_ros.node.metric_scale import MetricHook, ScalePorts
+from dyfn_ros.messages.rectify import Rectifier, RectifyRules
+from dyfn_ros.node.metric_scale import ScaleTopics
 from dyfn_ros.node.outputs import Outputs
 from dyfn_ros.node.parameters.table import Settings
 from dyfn_ros.node.statistics import FrameStatistics
@@ -44,20 +37,15 @@ Say = Callable[[str], None]
 class FrameJob:
     """One image on its way to inference.
 
-    info: the newest CameraInfo when the image came. epoch: resets before it came, and request
-    the reason of the last one. arrived: time.monotonic().
+    info: the newest CameraInfo when the image came. asked: the resets asked for before it came.
+    arrived: time.monotonic().
     """
 
     camera: Camera
     message: Any
     info: Any
-    epoch: int
-    request: str
+    asked: ResetRequest
     arrived: float
-
-
-def _no_model(key: Any) -> Any:
-    raise RuntimeError("the model is not loaded yet")
 
 
 class Camera:
@@ -83,18 +71,14 @@ class Camera:
         self.title = f"{node.get_name()}: {name}" if name else node.get_name()
         self.statistics = FrameStatistics()
         self.active = False
-        self.hooks: list[StreamHook] = []
-        self.stream = StreamSession(_no_model, hooks=self.hooks)
+        self.session: StreamSession | None = None  # once there is a model
         self.outputs = Outputs(ports, self.prefix, not settings().drop_frames)
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
         self._info: CameraInfo | None = None
-        self._epoch, self._request = 0, REQUESTED
-        self._epoch_lock = threading.Lock()
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
-        self._scale_ports = ScalePorts(ports, self.prefix, self.title, settings())
-        self.state: StateHook | None = None  # once there is a model
+        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings(), warn)
 
     @property
     def prefix(self) -> str:
@@ -132,27 +116,27 @@ class Camera:
 
     def _on_image(self, message: Any) -> None:
         self.statistics.count("received" if self.active else "inactive")
-        if not self.active:
+        session = self.session
+        if not self.active or session is None:
             return
-        now = time.monotonic()
-        with self._epoch_lock:
-            job = FrameJob(self, message, self._info, self._epoch, self._request, now)
+        job = FrameJob(self, message, self._info, session.asked, time.monotonic())
         if not self._submit(job):
             self._error(
                 f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
                 "full, newer frames are lost; play slower or raise it",
             )
 
-    def request_reset(self, reason: str) -> int:
-        """Frames that came before this call never touch the state after it. Any thread.
-
-        -> the number of resets asked for so far.
-        """
-        with self._epoch_lock:
-            self._epoch, self._request = self._epoch + 1, reason
-            return self._epoch
+    def request_reset(self, reason: str) -> None:
+        """Frames that came before this call never touch the state after it. Any thread."""
+        if self.session is not None:
+            self.session.request_reset(reason)
 
     # Any thread.
+
+    @property
+    def resets(self) -> dict[str, int]:
+        """How often the stream was reset, by reason."""
+        return {} if self.session is None else dict(self.session.resets)
 
     def save_state(self) -> str:
         """-> what was saved. Raises StateError."""
@@ -160,18 +144,14 @@ class Camera:
 
     def load_state(self) -> str:
         """As request_reset, with the state of a file. -> what was loaded. Raises StateError."""
-        settings = self.settings
-        return self._opened().load(
-            self._state_file(),
-            lambda: self.request_reset(REQUESTED),
-            settings.stabilize,
-            settings.num_tokens,
-        )
+        session = self._opened()
+        session.options = self.settings
+        return session.load(self._state_file())
 
-    def _opened(self) -> StateHook:
-        if self.state is None:
+    def _opened(self) -> StreamSession:
+        if self.session is None:
             raise StateError("the model is not loaded yet")
-        return self.state
+        return self.session
 
     def _state_file(self) -> str:
         settings = self.settings
@@ -181,20 +161,15 @@ class Camera:
 
     def open_stream(self, model: GeometryModel) -> None:
         """Once, before the first frame. Raises ValueError when a metric setting is unusable."""
-        source = self.settings.metric_source
-        if model.quantity == "disparity" and source != "none":
-            raise ValueError(
-                f"metric_source is {source!r}, but the model predicts disparity, whose unknown "
-                "shift no metric scale undoes; expected 'none'"
-            )
-        self.stream.make = stream_maker(model)
-        cut = SceneCutHook(lambda: self.settings.scene_cut_threshold)
-        metric = MetricHook(lambda: self.settings, self._scale_ports, self._warn)
-        self.state = StateHook(self.stream, metric, cut, model)
-        self.hooks += [cut, metric, self.state]
+        session = StreamSession(model, self.settings)
+        _ = session.fingerprint  # takes seconds for a large model, which nobody waits for here
+        self.session = self.scale_topics.session = session
 
-    def decode(self, job: FrameJob) -> tuple[StreamFrame, PinholeImage]:
-        """Raises MessageError when the image, or its lens, cannot be used."""
+    def decode(self, job: FrameJob) -> tuple[Frame, CameraInfo | None]:
+        """-> the frame and the CameraInfo that describes it as it now is.
+
+        Raises MessageError when the image, or its lens, cannot be used.
+        """
         settings = self.settings
         compressed = settings.image_transport == "compressed"
         image = decode_compressed(job.message) if compressed else decode_image(job.message)
@@ -205,32 +180,36 @@ class Camera:
             job.info or self._info,
             RectifyRules(settings.rectified, settings.distortion, settings.check_frame_id),
         )
-        frame = StreamFrame(
+        frame = Frame(
             image=view.image,
+            stamp=header.stamp.sec + header.stamp.nanosec * 1e-9,
             camera_matrix=view.matrix,
             visible=view.visible,
-            stamp=header.stamp.sec + header.stamp.nanosec * 1e-9,
             frame_id=header.frame_id,
-            stabilize=settings.stabilize,
-            num_tokens=settings.num_tokens,
-            epoch=job.epoch,
-            request=job.request,
         )
-        return frame, view
+        return frame, view.info
 
-    def begin(self, frame: StreamFrame) -> Any:
+    def begin(self, frame: Frame, asked: ResetRequest) -> DepthStream:
         """-> the DepthStream that the frame goes into."""
-        settings = self.settings
-        self.stream.rules = TimeRules(settings.stamp_tolerance, settings.max_gap)
-        return self.stream.begin(frame)
+        session = self._opened()
+        session.options = self.settings
+        return session.begin(frame, asked)
 
-    def publish(self, job: FrameJob, view: PinholeImage, geometry: Geometry) -> None:
+    def end(self, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
+        """-> what to publish."""
+        session = self._opened()
+        found = session.end(frame, prediction)
+        self.scale_topics.publish(session.scale)
+        return found
+
+    def publish(
+        self, job: FrameJob, frame: Frame, info: CameraInfo | None, found: Prediction[np.ndarray]
+    ) -> None:
         """Everything that somebody wants of a finished frame."""
         header = job.message.header
-        if geometry.reset:
-            counts = dict(self.stream.resets)
-            self.outputs.publish_reset(header, self.title, geometry.reset, counts)
-        self.outputs.publish(header, view.image, geometry, view.info, self.settings)
+        if found.reset:
+            self.outputs.publish_reset(header, self.title, found.reset, self.resets)
+        self.outputs.publish(header, frame.image, found, info, self.settings)
         stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         self.statistics.published(
             (self._node.get_clock().now().nanoseconds - stamp) * 1e-9,
@@ -244,10 +223,11 @@ class Camera:
 
     def failed(self, job: FrameJob, error: Exception) -> None:
         """The network, or publishing, failed on the job."""
-        self.stream.fail()
+        if self.session is not None:
+            self.session.fail()
         if not self._node.context.ok():  # shut down under our feet: nobody to publish to
             self.statistics.count("unpublished")
             return
         self.statistics.count("failed")
-        text = f"{self.image_topic}: inference failed, the stream starts anew"
+        text = f"{self.image_topic}: inference failed, the stream resets"
         self._error(f"{text}: {type(error).__name__}: {error}")

@@ -81,11 +81,12 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     for key in ("received", "published", "bad", "failed"):
         values[key] = str(snapshot.counts.get(key, 0))
     values["received while inactive"] = str(snapshot.counts.get("inactive", 0))
-    resets = dict(camera.stream.resets)
+    resets = camera.resets
     values["resets"] = str(sum(resets.values()))
     values.update({f"resets: {reason}": str(count) for reason, count in resets.items()})
-    for hook in camera.hooks:
-        values.update(hook.report())
+    if camera.session is not None:
+        values.update(camera.session.report())
+    values.update(camera.scale_topics.report())
     problems = _camera_problems(report, camera, snapshot)
     return _status(f"{report.name}: {camera.name or 'camera'}", problems, report.phase, values)
 
@@ -109,5 +110,6 @@ def _camera_problems(report: Report, camera: Camera, snapshot: Snapshot) -> list
         problems.append((WARN, f"no images on {camera.image_topic}"))
     if not snapshot.same_clock:
         problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
-    problems += [(WARN, text) for hook in camera.hooks for text in hook.problems()]
+    if camera.session is not None:
+        problems += [(WARN, text) for text in camera.session.problems()]
     return problems

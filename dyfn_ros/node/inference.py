@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from dyfn_core.stream.session import StreamFrame
+from sensor_msgs.msg import CameraInfo
+
+from dyfn_core.prediction import Frame, Prediction
+from dyfn_core.stream.depth_stream import DepthStream, push_together
 from dyfn_ros.messages.images import MessageError
-from dyfn_ros.messages.rectify import PinholeImage
 from dyfn_ros.node.camera import FrameJob
-
-if TYPE_CHECKING:
-    from dyfn_core.prediction import Prediction
-    from dyfn_core.stream.depth_stream import DepthStream
 
 
 @dataclass(frozen=True)
 class _Begun:
     job: FrameJob
-    frame: StreamFrame
-    view: PinholeImage
+    frame: Frame
+    info: CameraInfo | None
     stream: DepthStream
 
 
@@ -33,8 +31,9 @@ def run_jobs(jobs: Sequence[FrameJob], batch: bool) -> None:
     for job in jobs:
         begun = _begin(job)
         if begun is not None:
-            frame = begun.frame
-            kind: Any = (frame.image.shape, frame.num_tokens, frame.stabilize) if batch else job
+            stream = begun.stream
+            alike = (begun.frame.size, stream.num_tokens, stream.stabilize)
+            kind: Any = alike if batch else job
             groups.setdefault(kind, []).append(begun)
     for group in groups.values():
         _run_group(group)
@@ -42,8 +41,8 @@ def run_jobs(jobs: Sequence[FrameJob], batch: bool) -> None:
 
 def _begin(job: FrameJob) -> _Begun | None:
     try:
-        frame, view = job.camera.decode(job)
-        return _Begun(job, frame, view, job.camera.begin(frame))
+        frame, info = job.camera.decode(job)
+        return _Begun(job, frame, info, job.camera.begin(frame, job.asked))
     except MessageError as error:
         job.camera.bad(job, error)
     except Exception as error:
@@ -67,8 +66,6 @@ def _run_group(group: list[_Begun]) -> None:
 
 def _predict(group: list[_Begun]) -> list[Prediction]:
     """Raises what the network raises; the streams are then as they were."""
-    from dyfn_core.stream.depth_stream import push_together
-
     streams = [one.stream for one in group]
     memories = [stream.memory for stream in streams]
     try:
@@ -84,6 +81,6 @@ def _predict(group: list[_Begun]) -> list[Prediction]:
 def _publish(one: _Begun, prediction: Prediction) -> None:
     camera = one.job.camera
     try:
-        camera.publish(one.job, one.view, camera.stream.end(one.frame, prediction))
+        camera.publish(one.job, one.frame, one.info, camera.end(one.frame, prediction))
     except Exception as error:
         camera.failed(one.job, error)

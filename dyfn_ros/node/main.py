@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -13,16 +14,22 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import uninstall_signal_handlers
 
 from dyfn_ros.node.environment import prepare_environment
-from dyfn_ros.node.node import ModelLoader, StreamDepthNode, load_bundled
-from dyfn_ros.node.parameters.declare import usage
+
+if TYPE_CHECKING:
+    from dyfn_ros.node.node import ModelLoader, StreamDepthNode
 
 
-def _make(args: Sequence[str] | None, load: ModelLoader) -> StreamDepthNode | None:
+def _make(args: Sequence[str] | None, load: ModelLoader | None) -> StreamDepthNode | None:
     """The node; None, and the reason on stderr, when ROS or the parameters do not allow one."""
+    # Imports that take seconds, here where `main` knows what an interrupt means.
+    from dyfn_core.models import load_model
+    from dyfn_ros.node.node import StreamDepthNode
+    from dyfn_ros.node.parameters.declare import usage
+
     try:
         usage(sys.argv if args is None else args)
         rclpy.init(args=None if args is None else list(args))
-        return StreamDepthNode(load)
+        return StreamDepthNode(load or load_model)
     except (ParameterException, RuntimeError) as error:  # RuntimeError: what rcl does not accept
         print(f"stream_depth: {error}", file=sys.stderr)
         return None
@@ -59,10 +66,10 @@ def _run(node: StreamDepthNode) -> int:
     return 0
 
 
-def main(args: Sequence[str] | None = None, load: ModelLoader = load_bundled) -> int:
+def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> int:
     """-> exit code: 0 after SIGINT or SIGTERM, 1 when the node cannot run.
 
-    args: the command line; None takes sys.argv. load: (name, device) -> model.
+    args: the command line; None takes sys.argv. load: (name, device) -> model; None is load_model.
     """
     prepare_environment()
     node: StreamDepthNode | None = None

@@ -15,8 +15,9 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
-from dyfn_core.stream.session import REQUESTED, TIME_JUMP
-from dyfn_core.stream.state_hook import StateError
+from dyfn_core.models import load_model, resolve_device
+from dyfn_core.stream.resets import RESET_SERVICE, TIME_JUMP
+from dyfn_core.stream.saving import StateError
 from dyfn_ros.node.camera import Camera, FrameJob
 from dyfn_ros.node.diagnostics import Report, node_diagnostics
 from dyfn_ros.node.inference import run_jobs
@@ -36,13 +37,6 @@ _PATIENCE = 4.0  # seconds; ROS launch loses its own after 5
 _POLL = 0.1  # seconds between looks at the context while the model is loaded
 
 
-def load_bundled(name: str, device: str) -> GeometryModel:
-    """load_model, with its imports (seconds) made where nobody waits for them."""
-    from dyfn_core.models import load_model
-
-    return load_model(name, device=device)
-
-
 class StreamDepthNode(LifecycleNode):
     """Topics, services, parameters and states: docs/node.md.
 
@@ -50,7 +44,7 @@ class StreamDepthNode(LifecycleNode):
     thread, which lives from configure to cleanup.
     """
 
-    def __init__(self, load: ModelLoader = load_bundled, **node_options: Any) -> None:
+    def __init__(self, load: ModelLoader = load_model, **node_options: Any) -> None:
         super().__init__("stream_depth", **node_options)
         self._load = load
         self._throttle = Throttle()
@@ -229,9 +223,9 @@ class StreamDepthNode(LifecycleNode):
     def _on_reset(
         self, indices: list[int], _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        dropped = sum(self._reset(index, REQUESTED) for index in indices)
+        dropped = sum(self._reset(index, RESET_SERVICE) for index in indices)
         response.success = True
-        response.message = f"the next frame starts anew ({dropped} waiting frames dropped)"
+        response.message = f"the next frame resets the stream ({dropped} waiting frames dropped)"
         if line := self._throttle(f"reset: {response.message}"):
             self.get_logger().info(line)
         return response
@@ -289,9 +283,7 @@ class StreamDepthNode(LifecycleNode):
         settings = self.settings
         if settings.threads:
             torch.set_num_threads(settings.threads)
-        device = settings.device
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
+        device = str(resolve_device(settings.device))
         model = self._load(settings.model, device)
         for camera in self._cameras:
             camera.open_stream(model)
@@ -323,7 +315,7 @@ class StreamDepthNode(LifecycleNode):
                 f"{camera.name + ': ' if camera.name else ''}{counts['received']} frames received, "
                 f"{counts['published']} worked on, "
                 f"{self._dropped(index) + counts['unpublished']} dropped, {counts['bad']} bad, "
-                f"{counts['failed']} failed; {sum(camera.stream.resets.values())} resets"
+                f"{counts['failed']} failed; {sum(camera.resets.values())} resets"
             )
         return lines
 

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from dyfn_core.geometry.edges import flying_pixels
-from dyfn_core.stream.session import Geometry
+from dyfn_core.prediction import Prediction
 from dyfn_ros.messages.camera_info import camera_info_message
 from dyfn_ros.messages.clouds import cloud_message, pack_cloud
 from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
@@ -54,13 +54,13 @@ class Outputs:
         self,
         header: Any,
         image: np.ndarray,
-        geometry: Geometry,
+        prediction: Prediction[np.ndarray],
         info: CameraInfo | None,
         settings: Settings,
     ) -> None:
         """header: of the input, kept as it is. info: describes the image; None when unknown."""
-        depth, encoding = geometry.depth, settings.depth_encoding
-        valid = in_range(depth, geometry.valid, settings.min_depth, settings.max_depth)
+        depth, encoding = prediction.depth, settings.depth_encoding
+        valid = in_range(depth, prediction.valid, settings.min_depth, settings.max_depth)
         if settings.publish_depth:
             if self._depth.get_subscription_count():
                 self._depth.publish(depth_message(header, depth, valid, encoding))
@@ -69,14 +69,14 @@ class Outputs:
                 packed = encode_compressed_depth(depth, valid, encoding, farthest)
                 self._packed.publish(compressed_message(header, *packed))
             if self._info.get_subscription_count():
-                self._info.publish(_sibling_info(header, info, geometry))
+                self._info.publish(_sibling_info(header, info, prediction))
         if settings.publish_colored and self._colored.get_subscription_count():
-            if geometry.reset:
+            if prediction.reset:
                 self._colours = ColourScale()
             painted = self._colours.paint(np.where(valid, depth, np.nan))
             self._colored.publish(colour_message(header, painted))
         if settings.publish_points and self._points.get_subscription_count():
-            cloud = filtered_cloud(geometry, valid, image, settings)
+            cloud = filtered_cloud(prediction, valid, image, settings)
             self._points.publish(cloud_message(header, cloud))
 
     def publish_reset(self, header: Any, name: str, reason: str, counts: dict[str, int]) -> None:
@@ -113,20 +113,20 @@ class ColourScale:
 
 
 def filtered_cloud(
-    geometry: Geometry, valid: np.ndarray, image: np.ndarray, settings: Settings
+    prediction: Prediction[np.ndarray], valid: np.ndarray, image: np.ndarray, settings: Settings
 ) -> np.ndarray:
     """The cloud that the points_... settings ask for: h x w of CLOUD_DTYPE.
 
     Range and edges are judged at full resolution; the stride then takes the middle pixel of each
     block.
     """
-    valid = in_range(geometry.depth, valid, settings.points_min_depth, settings.points_max_depth)
+    valid = in_range(prediction.depth, valid, settings.points_min_depth, settings.points_max_depth)
     if settings.points_edge_filter:
-        valid &= ~flying_pixels(geometry.depth, valid, settings.points_edge_filter)
+        valid &= ~flying_pixels(prediction.depth, valid, settings.points_edge_filter)
     stride = settings.points_stride
     first = (min(stride, *valid.shape) - 1) // 2
     grid = (slice(first, None, stride),) * 2
-    return pack_cloud(geometry.points[grid], valid[grid], image[grid])
+    return pack_cloud(prediction.points[grid], valid[grid], image[grid])
 
 
 def in_range(depth: np.ndarray, valid: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -135,11 +135,13 @@ def in_range(depth: np.ndarray, valid: np.ndarray, near: float, far: float) -> n
     return valid & (depth <= far) if far else valid
 
 
-def _sibling_info(header: Any, info: CameraInfo | None, geometry: Geometry) -> CameraInfo:
+def _sibling_info(
+    header: Any, info: CameraInfo | None, prediction: Prediction[np.ndarray]
+) -> CameraInfo:
     """The camera_info beside the depth image: the camera's own, or what is known."""
     if info is None:
-        height, width = geometry.depth.shape
-        return camera_info_message(header, geometry.camera_matrix, height, width)
+        height, width = prediction.depth.shape
+        return camera_info_message(header, prediction.camera_matrix, height, width)
     sibling = copy.copy(info)
     sibling.header = header
     return sibling

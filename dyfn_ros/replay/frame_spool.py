@@ -13,8 +13,8 @@ import numpy as np
 
 from dyfn_core.files import cannot_write
 from dyfn_core.geometry.edges import flying_pixels
+from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.protocols import to_shape
-from dyfn_core.stream.session import Geometry
 from dyfn_ros.recordings.open import RecordedFrame
 
 MAX_SIDE = 320  # pixels of the longer side of what is kept
@@ -58,9 +58,11 @@ class FrameSpool:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def push(self, frame: RecordedFrame, geometry: Geometry, pose: np.ndarray | None) -> None:
+    def push(
+        self, frame: RecordedFrame, prediction: Prediction[np.ndarray], pose: np.ndarray | None
+    ) -> None:
         """Keep a frame, small."""
-        small = shrink(frame, geometry, pose)
+        small = shrink(frame, prediction, pose)
         missing = np.empty(0)
         arrays = (
             np.array(small.stamp_ns),
@@ -96,14 +98,16 @@ class FrameSpool:
             )
 
 
-def shrink(frame: RecordedFrame, geometry: Geometry, pose: np.ndarray | None) -> SmallFrame:
+def shrink(
+    frame: RecordedFrame, prediction: Prediction[np.ndarray], pose: np.ndarray | None
+) -> SmallFrame:
     """Every s-th row and column from s // 2, s the smallest that gives at most MAX_SIDE of them."""
-    shape = geometry.depth.shape
+    shape = prediction.depth.shape
     step = math.ceil(max(shape) / MAX_SIDE)
     grid = (slice(step // 2, None, step),) * 2
-    said, valid = geometry.said
-    solid = geometry.valid & ~flying_pixels(geometry.depth, geometry.valid, EDGE)
-    matrix = geometry.camera_matrix.astype(np.float64).copy()
+    said, valid = prediction.aligned_quantity
+    solid = prediction.valid & ~flying_pixels(prediction.depth, prediction.valid, EDGE)
+    matrix = prediction.camera_matrix.astype(np.float64).copy()
     matrix[:2, 2] -= step // 2
     matrix[:2] /= step
     small = np.where(valid, said, np.nan).astype(np.float32)[grid]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.protocols import FrameScore, sample_grid
-from dyfn_core.stream.session import Geometry
 from dyfn_ros.messages.clouds import CLOUD_OFFSETS, CLOUD_STEP, pack_cloud
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.recordings.open import RecordedFrame
@@ -44,18 +44,20 @@ class ReplayRecording:
     def __exit__(self, *error: Any) -> None:
         self._writer.__exit__(*error)
 
-    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
+    def write(
+        self, frame: RecordedFrame, prediction: Prediction[np.ndarray], score: FrameScore
+    ) -> None:
         """Everything of one frame."""
         self._write_input(frame)
         head = header(frame.stamp_ns, frame.frame_id)
-        image = TYPES.types[IMAGE](header=head, **depth_fields(geometry.depth, geometry.valid))
+        image = TYPES.types[IMAGE](header=head, **depth_fields(prediction.depth, prediction.valid))
         self._writer.write("/stream_depth/depth/image", IMAGE, image, frame.stamp_ns)
-        topic, size = "/stream_depth/depth/camera_info", geometry.depth.shape
-        info = camera_info(geometry.camera_matrix, size, frame.stamp_ns, frame.frame_id)
+        topic, size = "/stream_depth/depth/camera_info", prediction.depth.shape
+        info = camera_info(prediction.camera_matrix, size, frame.stamp_ns, frame.frame_id)
         self._writer.write(topic, CAMERA_INFO, info, frame.stamp_ns)
-        cloud = cloud_message(frame, geometry)
+        cloud = cloud_message(frame, prediction)
         self._writer.write("/stream_depth/points", POINT_CLOUD, cloud, frame.stamp_ns)
-        for name, value in score_values(geometry, score).items():
+        for name, value in score_values(prediction, score).items():
             number = TYPES.types[FLOAT](data=value)
             self._writer.write(f"/stream_depth/{name}", FLOAT, number, frame.stamp_ns)
 
@@ -70,9 +72,9 @@ class ReplayRecording:
         self._writer.write_jpeg(topic, frame.image, frame.stamp_ns, frame.frame_id)
 
 
-def cloud_message(frame: RecordedFrame, geometry: Geometry) -> Any:
+def cloud_message(frame: RecordedFrame, prediction: Prediction[np.ndarray]) -> Any:
     """A PointCloud2 of every s-th point, s the smallest that gives at most MAX_POINTS."""
-    cloud = pack_cloud(*subsampled(frame, geometry))
+    cloud = pack_cloud(*subsampled(frame, prediction))
     field = TYPES.types["sensor_msgs/msg/PointField"]
     return TYPES.types[POINT_CLOUD](
         header=header(frame.stamp_ns, frame.frame_id),
@@ -91,22 +93,22 @@ def cloud_message(frame: RecordedFrame, geometry: Geometry) -> Any:
 
 
 def subsampled(
-    frame: RecordedFrame, geometry: Geometry
+    frame: RecordedFrame, prediction: Prediction[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, validity and colours of every s-th row and column, at most MAX_POINTS."""
-    grid = sample_grid(geometry.depth.shape, MAX_POINTS)
-    return geometry.points[grid], geometry.valid[grid], frame.image[grid]
+    grid = sample_grid(prediction.depth.shape, MAX_POINTS)
+    return prediction.points[grid], prediction.valid[grid], frame.image[grid]
 
 
-def score_values(geometry: Geometry, score: FrameScore) -> dict[str, float]:
+def score_values(prediction: Prediction[np.ndarray], score: FrameScore) -> dict[str, float]:
     """What is plotted over time: the frame's median depth, and with truth its own alignment.
 
     median_depth: in the unit of the depth. scale, shift: what aligns this frame alone to the
     truth (image protocol; shift in metres). abs_rel: after that.
     """
     values: dict[str, float] = {}
-    if geometry.valid.any():
-        values["median_depth"] = float(np.median(geometry.depth[geometry.valid]))
+    if prediction.valid.any():
+        values["median_depth"] = float(np.median(prediction.depth[prediction.valid]))
     if score.metrics is not None and score.scale is not None and score.shift is not None:
         values |= {"scale": score.scale, "shift": score.shift, "abs_rel": score.metrics["abs_rel"]}
     return values

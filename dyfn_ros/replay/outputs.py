@@ -14,9 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from dyfn_core.files import cannot_write
-from dyfn_core.prediction import DEPTH
+from dyfn_core.prediction import DEPTH, Prediction
 from dyfn_core.scoring.protocols import FrameScore
-from dyfn_core.stream.session import Geometry
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.recordings.poses import PoseError, PoseLookup, open_poses
 from dyfn_ros.replay.cloud import write_cloud
@@ -56,7 +55,9 @@ class OutputOptions:
 
 
 class _Writer(Protocol):
-    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None: ...
+    def write(
+        self, frame: RecordedFrame, prediction: Prediction[np.ndarray], score: FrameScore
+    ) -> None: ...
 
 
 class ReplayOutputs:
@@ -113,16 +114,18 @@ class ReplayOutputs:
             for name in FILES.keys() - self._done:  # of an earlier run: not of these frames
                 (self._folder / FILES[name]).unlink(missing_ok=True)
 
-    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
+    def write(
+        self, frame: RecordedFrame, prediction: Prediction[np.ndarray], score: FrameScore
+    ) -> None:
         """One frame, in order."""
         for path, writer in self._writers:
             try:
-                writer.write(frame, geometry, score)
+                writer.write(frame, prediction, score)
             except OSError as error:
                 raise cannot_write(path, error) from error
         if self._spool is not None:
             pose = self._pose(frame) if self._fuse else None
-            self._spool.push(frame, geometry, pose)
+            self._spool.push(frame, prediction, pose)
 
     def finish(self, alignment: Alignment | None, quantity: str = DEPTH) -> None:
         """Write what needs the alignment of the whole sequence; None when there is no truth.

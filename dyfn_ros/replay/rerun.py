@@ -10,8 +10,8 @@ import numpy as np
 
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.files import OutputError
+from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.protocols import FrameScore
-from dyfn_core.stream.session import Geometry
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.replay.mcap import score_values, subsampled
 
@@ -75,7 +75,9 @@ class RerunRecording:
         if self._frames and not RrdReader(self._partial).recordings():  # an intact index
             raise ValueError("the file holds no recording after it was written")
 
-    def write(self, frame: RecordedFrame, geometry: Geometry, score: FrameScore) -> None:
+    def write(
+        self, frame: RecordedFrame, prediction: Prediction[np.ndarray], score: FrameScore
+    ) -> None:
         """Everything of one frame."""
         free = shutil.disk_usage(self._path.parent).free
         if free < ROOM:
@@ -89,13 +91,13 @@ class RerunRecording:
         self._frames += 1
         jpeg = encode_picture(frame.image, ".jpg")
         log("camera/image", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
-        height, width = geometry.depth.shape
-        matrix = geometry.camera_matrix
+        height, width = prediction.depth.shape
+        matrix = prediction.camera_matrix
         pinhole = rr.Pinhole(image_from_camera=matrix, width=width, height=height)
         log("camera", pinhole)
-        depth = np.where(geometry.valid, geometry.depth, 0).astype(np.float32)
+        depth = np.where(prediction.valid, prediction.depth, 0).astype(np.float32)
         log("camera/depth", rr.DepthImage(depth, meter=1.0))
-        points, valid, colours = subsampled(frame, geometry)
+        points, valid, colours = subsampled(frame, prediction)
         log("points", rr.Points3D(points[valid], colors=colours[valid]))
-        for name, value in score_values(geometry, score).items():
+        for name, value in score_values(prediction, score).items():
             log(f"scores/{name}", rr.Scalars(value))

@@ -16,10 +16,10 @@ from tqdm import tqdm
 
 from dyfn_core.evaluation.benchmarks.predictions import scored_quantity
 from dyfn_core.evaluation.sequence import SequenceEvaluation
-from dyfn_core.prediction import DEPTH
+from dyfn_core.prediction import DEPTH, Frame
 from dyfn_core.scoring.protocols import FrameScore, SequenceScorer, predicted, to_shape
-from dyfn_core.stream.scene_cut_hook import SceneCutHook
-from dyfn_core.stream.session import StreamFrame, StreamSession, stream_maker
+from dyfn_core.stream.options import StreamOptions
+from dyfn_core.stream.session import StreamSession
 from dyfn_core.threads import computing_threads
 from dyfn_ros.recordings.open import (
     RecordedFrame,
@@ -204,8 +204,12 @@ def _run(
     model: GeometryModel,
     outputs: ReplayOutputs | None = None,
 ) -> SequenceEvaluation:
-    cuts = SceneCutHook(lambda: options.scene_cut_threshold)
-    camera = StreamSession(stream_maker(model), hooks=[cuts])
+    chosen = StreamOptions(
+        stabilize=options.stabilizer,
+        num_tokens=options.num_tokens or 0,
+        scene_cut_threshold=options.scene_cut_threshold,
+    )
+    session = StreamSession(model, chosen)
     frames, expected = _frames(options, recording)
     evaluation = SequenceEvaluation(expected, options.depth_max, model.quantity)
     with outputs or nullcontext():
@@ -215,22 +219,16 @@ def _run(
             start = time.perf_counter()
             seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
             stamp = seconds + nanoseconds * 1e-9
-            geometry = camera.push(
-                StreamFrame(
-                    frame.image,
-                    frame.camera_matrix,
-                    visible=frame.visible,
-                    stamp=stamp,
-                    frame_id=frame.frame_id,
-                    stabilize=options.stabilizer,
-                    num_tokens=options.num_tokens or 0,
+            prediction = session.push(
+                Frame(
+                    frame.image, stamp, frame.camera_matrix, frame.visible, frame_id=frame.frame_id
                 )
             )
             latency = time.perf_counter() - start
             # Disparity is aligned as such, also where its inverse is too far to be depth.
-            score = _push(evaluation, recording, frame, geometry.said, stamp, latency)
+            score = _push(evaluation, recording, frame, prediction.aligned_quantity, stamp, latency)
             if outputs is not None:
-                outputs.write(frame, geometry, score)
+                outputs.write(frame, prediction, score)
         if outputs is not None:
             video, quantity = evaluation.video(), model.quantity
             alignment = None if video is None else Alignment(video.scale, video.shift, quantity)

@@ -17,8 +17,8 @@ _MODELS = _WORDS | {"geometry", "models"}
 ROOMS: dict[str, dict[str, set[str]]] = {
     "dyfn_core": {
         **{word: set() for word in ("files", "threads", "argument_types")},
-        "prediction": set(),
-        "geometry": _WORDS,
+        "geometry": _WORDS - {"prediction"},
+        "prediction": {"geometry"},
         "metric": _WORDS | {"geometry"},
         "models": _WORDS | {"geometry"},
         "scoring": _WORDS | {"geometry"},

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Mapping, Sequence
+from textwrap import wrap
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -18,7 +19,16 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
-from dyfn_ros.node.parameters.table import CONFIGURE, LIMITS, SPECS, START, Settings, Spec, show
+from dyfn_ros.node.parameters.table import (
+    CONFIGURE,
+    LIMITS,
+    SPECS,
+    START,
+    Settings,
+    Spec,
+    groups,
+    show,
+)
 
 _CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
@@ -28,9 +38,12 @@ def usage(arguments: Sequence[str]) -> None:
 
     arguments: with the program's name first.
     """
-    lines = [
-        f"  {name:22}{spec.description} [{show(spec.default)}]" for name, spec in SPECS.items()
-    ]
+    lines = []
+    for group, specs in groups().items():
+        lines.append(f"\n{group}:")
+        for name, spec in specs.items():
+            lines.append(f"  {name} [{show(spec.default)}]")
+            lines += wrap(spec.description, 90, initial_indent=" " * 6, subsequent_indent=" " * 6)
     parser = argparse.ArgumentParser(
         prog="stream_depth",
         usage="stream_depth [--ros-args -r image:=TOPIC -r camera_info:=TOPIC -p NAME:=VALUE ...]",

@@ -1,9 +1,11 @@
-"""What one parameter of the node is; parameter_table.py has them all."""
+"""What one parameter of the node is; table.py has them all."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
+
+from dyfn_core.stream.options import Option
 
 Value = str | bool | int | float | list[str]
 
@@ -35,3 +37,21 @@ def parameter(group: str, default: Value, description: str, **options: Any) -> A
     if isinstance(default, list):
         return field(default_factory=lambda: list(default), metadata={"spec": spec})
     return field(default=default, metadata={"spec": spec})
+
+
+def spec_of(entry: Any) -> Spec:
+    """Of a field made by `parameter`, or by a stream's `option`: those a camera may have itself."""
+    if "spec" in entry.metadata:
+        spec: Spec = entry.metadata["spec"]
+        return spec
+    option: Option = entry.metadata["option"]
+    default: Value = entry.default
+    return Spec(
+        default,
+        option.description,
+        option.group,
+        changes=RUN if option.live else CONFIGURE,
+        per_camera=True,
+        range=option.range,
+        choices=option.choices,
+    )

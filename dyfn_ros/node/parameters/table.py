@@ -7,9 +7,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+from dyfn_core.stream.options import SCALE, STREAM, StreamOptions
 from dyfn_core.threads import THREADS
-from dyfn_ros.node.parameters.metric import SCALE, MetricSettings
-from dyfn_ros.node.parameters.spec import CONFIGURE, MARKS, RUN, START, Spec
+from dyfn_ros.messages.references import ReferenceOptions
+from dyfn_ros.node.parameters.spec import CONFIGURE, MARKS, RUN, START, Spec, spec_of
 from dyfn_ros.node.parameters.spec import parameter as _parameter
 
 __all__ = [
@@ -25,11 +26,11 @@ __all__ = [
     "show",
 ]
 
-_NODE, _INPUT, _STREAM, _OUTPUT, _CLOUD = "Node", "Input", "Stream", "Output", "Cloud"
+_NODE, _INPUT, _OUTPUT, _CLOUD = "Node", "Input", "Output", "Cloud"
 
 
 @dataclass(frozen=True)
-class Settings(MetricSettings):
+class Settings(ReferenceOptions, StreamOptions):
     """The values in force; a new one for each change. The fields are the table."""
 
     cameras: list[str] = _parameter(
@@ -76,8 +77,8 @@ class Settings(MetricSettings):
     reliability: str = _parameter(
         _INPUT,
         "auto",
-        "Of the subscriptions; auto is reliable when drop_frames is false, else best effort, "
-        "which every camera driver matches.",
+        "QoS reliability of the subscriptions. auto: reliable if drop_frames is false, else best "
+        "effort, which every camera driver matches.",
         per_camera=True,
         choices=("auto", "best_effort", "reliable"),
     )
@@ -123,57 +124,6 @@ class Settings(MetricSettings):
         per_camera=True,
     )
 
-    stabilize: bool = _parameter(
-        _STREAM,
-        True,
-        "Use DyFN. A change starts the stream anew.",
-        changes=RUN,
-        per_camera=True,
-    )
-    num_tokens: int = _parameter(
-        _STREAM,
-        0,
-        "Resolution inside the model; 0 is the model's own. A change starts the stream anew.",
-        changes=RUN,
-        per_camera=True,
-        range=(0, 100_000),
-    )
-    stamp_tolerance: float = _parameter(
-        _STREAM,
-        0.2,
-        "Seconds that a stamp (or ROS time) may go back before the stream starts anew.",
-        changes=RUN,
-        per_camera=True,
-        range=(0.0, 1e6),
-    )
-    max_gap: float = _parameter(
-        _STREAM,
-        5.0,
-        "Seconds from one frame's stamp to the next (or a jump of ROS time) beyond which the "
-        "stream starts anew; 0 is no limit.",
-        changes=RUN,
-        per_camera=True,
-        range=(0.0, 1e6),
-    )
-
-    scene_cut_threshold: float = _parameter(
-        _STREAM,
-        0.6,
-        "Difference of two pictures in a row beyond which the camera is somewhere else and the "
-        "stream starts anew; 0 switches it off. See docs/metric_scale.md.",
-        changes=RUN,
-        per_camera=True,
-        range=(0.0, 2.0),
-    )
-    state_file: str = _parameter(
-        _STREAM,
-        "",
-        "Where ~/save_state writes and ~/load_state reads. Several cameras that share it put their "
-        "name before the suffix.",
-        changes=RUN,
-        per_camera=True,
-    )
-
     publish_depth: bool = _parameter(
         _OUTPUT, True, "Publish ~/depth/... when somebody subscribes.", changes=RUN, per_camera=True
     )
@@ -215,7 +165,7 @@ class Settings(MetricSettings):
     points_stride: int = _parameter(
         _CLOUD,
         1,
-        "Every so many rows and columns of the image give a point.",
+        "Every N-th row and column of the image gives a point.",
         changes=RUN,
         per_camera=True,
         range=(1, 64),
@@ -254,7 +204,7 @@ class Settings(MetricSettings):
         return self.reliability == "reliable"
 
 
-SPECS: dict[str, Spec] = {entry.name: entry.metadata["spec"] for entry in fields(Settings)}
+SPECS: dict[str, Spec] = {entry.name: spec_of(entry) for entry in fields(Settings)}
 
 # Pairs of a lower and an upper limit; an upper limit of 0 is none.
 LIMITS = (("min_depth", "max_depth"), ("points_min_depth", "points_max_depth"))
@@ -271,7 +221,7 @@ def show(value: Any) -> str:
 
 def groups() -> dict[str, dict[str, Spec]]:
     """The table by heading, in order."""
-    order = (_NODE, _INPUT, _STREAM, SCALE, _OUTPUT, _CLOUD)
+    order = (_NODE, _INPUT, STREAM, SCALE, _OUTPUT, _CLOUD)
     result: dict[str, dict[str, Spec]] = {group: {} for group in order}
     for name, spec in SPECS.items():
         result[spec.group][name] = spec

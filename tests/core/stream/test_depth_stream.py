@@ -13,6 +13,7 @@ from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.prediction import Prediction, StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, RobustMean, push_together
+from dyfn_core.stream.resets import BACKWARDS, GAP, TimeRules
 from tests.support.pinhole import FOV_X, PinholeModel, picture
 
 FOCAL = 32 / np.tan(np.radians(FOV_X / 2))
@@ -105,12 +106,12 @@ def test_new_camera_matrix_resets_and_the_same_one_does_not(pinhole: PinholeMode
     assert not stream.resets  # nothing had been seen yet
     stream.push(picture())
     stream.camera_matrix = CAMERA
-    assert stream.resets == {"camera matrix changed": 1}
+    assert stream.resets == {"intrinsics changed": 1}
     stream.push(picture())
     stream.camera_matrix = CAMERA.copy()
     assert stream.memory.frames == 1
     stream.camera_matrix = None
-    assert stream.resets == {"camera matrix changed": 2}
+    assert stream.resets == {"intrinsics changed": 2}
     assert stream.camera_matrix is None
 
 
@@ -124,6 +125,46 @@ def test_new_image_size_resets_and_forgets_the_camera(
     assert stream.resets == {"image size changed": 1}
     assert stream.camera_matrix is None and "forgetting" in caplog.text
     assert equal(prediction, DepthStream(pinhole).push(larger))
+
+
+def test_stamps_that_jump_reset_the_stream_and_say_so(small_moge: MoGeModel) -> None:
+    stream = DepthStream(small_moge)
+    frames = [noise(seed, 50, 60) for seed in range(4)]
+    stamps = (0.0, 0.1, -1e6, -1e6 + 60)
+    found = [stream.push(frame, stamp) for frame, stamp in zip(frames, stamps, strict=True)]
+    assert [one.reset for one in found] == [None, None, BACKWARDS, GAP]
+    assert stream.resets == {BACKWARDS: 1, GAP: 1}
+    assert equal(found[2], DepthStream(small_moge).push(frames[2]))
+    assert not equal(found[1], DepthStream(small_moge).push(frames[1]))
+
+
+def test_rules_of_ones_own_and_frames_without_stamps_go_on(pinhole: PinholeModel) -> None:
+    patient = DepthStream(pinhole, rules=TimeRules(tolerance=10.0, max_gap=0.0))
+    for stamp in (0.0, 1e6, 1e6 - 9):
+        patient.push(picture(), stamp)
+    blind = DepthStream(pinhole)
+    for _ in range(3):
+        blind.push(picture())
+    assert patient.memory.frames == blind.memory.frames == 3
+    assert not patient.resets and not blind.resets
+
+
+def test_a_batch_obeys_each_stream_s_own_stamps(pinhole: PinholeModel) -> None:
+    streams = [DepthStream(pinhole), DepthStream(pinhole)]
+    push_together(streams, [picture(), picture()], [0.0, 0.0])
+    found = push_together(streams, [picture(), picture()], [0.1, 60.0])
+    assert [one.reset for one in found] == [None, GAP]
+    assert [stream.memory.frames for stream in streams] == [2, 1]
+
+
+def test_intrinsics_come_in_pixels(pinhole: PinholeModel) -> None:
+    known = DepthStream(pinhole, CAMERA).push(picture())
+    np.testing.assert_array_equal(known.camera_matrix, CAMERA)
+    found = DepthStream(pinhole).push(picture())
+    np.testing.assert_allclose(found.camera_matrix, CAMERA, rtol=1e-3)
+    arrays = found.numpy()
+    np.testing.assert_array_equal(arrays.camera_matrix, found.camera_matrix)
+    np.testing.assert_array_equal(arrays.valid, found.valid.numpy())
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from dyfn_core.metric.calibration import ScaleCalibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
+from dyfn_core.models.checkpoints import model_fingerprint
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
@@ -26,7 +27,6 @@ from dyfn_core.stream.state_file import (
     SavedStream,
     StateFileError,
     load_stream,
-    model_fingerprint,
     restore,
     save_stream,
 )

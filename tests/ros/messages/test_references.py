@@ -16,9 +16,11 @@ from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField, Range
 from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
 from dyfn_ros.messages.images import MessageError
 from dyfn_ros.messages.references import (
+    ReferenceOptions,
     decode_points,
     decode_range,
     decode_scan,
+    message_references,
     parse_transform,
     reference_decoder,
 )
@@ -196,6 +198,26 @@ def test_each_type_becomes_its_kind_of_measurement() -> None:
     assert isinstance(decoded, ConeReference)
     np.testing.assert_allclose(decoded.hit, [2.5, 0, 0])
     assert decoded.half_angle == pytest.approx(0.2)
+
+
+def test_a_message_is_decoded_when_a_frame_needs_it_and_a_bad_one_is_counted() -> None:
+    warnings: list[str] = []
+    make = message_references(ReferenceOptions(), warnings.append)
+    broken, good = cloud(POINTS), cloud([(0.0, 0.0, 2.0)])
+    broken.fields = []
+    view = SimpleNamespace(
+        points=np.ones((3, 3, 3), np.float32),
+        depth=np.ones((3, 3), np.float32),
+        valid=np.ones((3, 3), bool),
+        camera_matrix=np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]),
+    )
+    bad = make(broken)
+    assert not warnings
+    assert bad.evidence(view, 5.0).dropped == {"not decodable": 1}
+    assert "expected x, y and z" in warnings[0]
+    assert make(good).evidence(view, 5.0).measured.tolist() == [2.0]
+    with pytest.raises(ValueError, match="expected seven numbers"):
+        message_references(ReferenceOptions(reference_transform="1 2"), warnings.append)
 
 
 def test_messages_of_recordings_are_read_as_well() -> None:

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.stream.depth_stream import DepthStream
-from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.clouds import cloud_points
 from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 from tests.support.probe import Probe, stamp_of, stamped, statuses
 from tests.support.ros_graph import (
@@ -322,7 +322,7 @@ def test_cloud_filters_thin_crop_and_cut_edges(rig: Rig) -> None:
         assert rig.probe.set(name, wanted[name]).successful
     rig.reset()
     stamp = rig.send("front", frames(1)[0])
-    cloud = messages.cloud_points(rig.message("front/points", stamp))
+    cloud = cloud_points(rig.message("front/points", stamp))
     assert np.array_equal(as_depth(rig.depth("front", stamp)), depth, equal_nan=True)
     for name in ("points_min_depth", "points_max_depth", "points_edge_filter"):
         assert rig.probe.set(name, 0.0).successful

@@ -19,6 +19,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.clouds import cloud_points
 from tests.support.ros_graph import (
     NODE,
     RELIABLE,
@@ -125,7 +126,7 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
     assert (value(bench, "unit"), value(bench, "source")) == ("relative", "reference")
 
     assert client.set_parameter("until_metric", "relative").successful
-    relative = messages.cloud_points(client.result(client.send(picture))["points"])
+    relative = cloud_points(client.result(client.send(picture))["points"])
     xyz = np.stack([relative[axis] for axis in "xyz"], -1).reshape(-1, 3)
     xyz = xyz[np.isfinite(xyz).all(1)]
     known = 3.0 * xyz[:: max(1, len(xyz) // 60)]

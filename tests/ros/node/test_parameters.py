@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 import yaml
 
+from dyfn_core.stream.options import StreamOptions, options_of
+from dyfn_ros.messages.references import ReferenceOptions
 from dyfn_ros.node.parameters import docs as parameter_docs
 from dyfn_ros.node.parameters.declare import check, check_cameras, usage
 from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, Settings
@@ -72,6 +74,19 @@ def test_every_default_has_the_type_of_its_field_and_lies_in_its_range() -> None
         if spec.range:
             assert isinstance(spec.default, (int, float))
             assert spec.range[0] <= spec.default <= spec.range[1]
+
+
+def test_stream_parameters_are_the_stream_s_options_with_the_same_defaults() -> None:
+    described = {**options_of(StreamOptions), **options_of(ReferenceOptions)}
+    for name, option in described.items():
+        spec = SPECS[name]
+        assert (spec.description, spec.range, spec.choices, spec.group) == (
+            *(option.description, option.range, option.choices, option.group),
+        )
+        assert spec.per_camera
+        assert spec.changes == (RUN if option.live else CONFIGURE)
+    node, stream = Settings(), StreamOptions()
+    assert all(getattr(node, name) == getattr(stream, name) for name in options_of(StreamOptions))
 
 
 @pytest.mark.parametrize(
@@ -146,7 +161,7 @@ def test_help_shows_parameters_and_strange_arguments_are_refused(
     with pytest.raises(SystemExit) as asked:
         usage(["stream_depth", "--help"])
     assert asked.value.code == 0
-    shown = capsys.readouterr().out
+    shown = " ".join(capsys.readouterr().out.split())
     assert all(name in shown and spec.description in shown for name, spec in SPECS.items())
     with pytest.raises(SystemExit) as refused:
         usage(["stream_depth", "--model", "x"])

@@ -19,6 +19,8 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_ros.messages import images as messages
+from dyfn_ros.messages.camera_info import decode_camera_info
+from dyfn_ros.messages.clouds import cloud_points
 from tests.support.made_pictures import png
 from tests.support.ros_graph import (
     DEADLINE,
@@ -85,7 +87,7 @@ def lossless(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[NodePro
 
 @pytest.fixture
 def client(lossless: tuple[NodeProcess, Client]) -> Client:
-    """The node starts anew, without a usable CameraInfo."""
+    """The node is restarted, without a usable CameraInfo."""
     lossless[1].send_info(camera_info(focal=0.0))
     lossless[1].prime()
     lossless[1].reset()
@@ -160,7 +162,7 @@ def test_cloud_projects_back_onto_its_pixels(client: Client, size: tuple[int, in
     matrix = calibrate(client, height=size[0], width=size[1])
     image = frames(1, *size)[0]
     result = play(client, [image])[0]
-    cloud = messages.cloud_points(result["points"])
+    cloud = cloud_points(result["points"])
     xyz = np.stack([cloud[axis] for axis in "xyz"], axis=2).astype(np.float64)
     valid = np.isfinite(xyz).all(axis=2)
     assert 0.3 < valid.mean() < 1
@@ -189,8 +191,8 @@ def test_camera_info_passes_through_with_the_image_header(client: Client) -> Non
 def test_without_calibration_the_cloud_fits_the_estimated_camera(client: Client) -> None:
     result = play(client, frames(1))[0]
     info = result["depth/camera_info"]
-    matrix = messages.decode_camera_info(info, 36, 48).matrix
-    cloud = messages.cloud_points(result["points"])
+    matrix = decode_camera_info(info, 36, 48).matrix
+    cloud = cloud_points(result["points"])
     xyz = np.stack([cloud[axis] for axis in "xyz"], axis=2).astype(np.float64)
     valid = np.isfinite(xyz).all(axis=2)
     projected = xyz[valid] @ matrix.T
@@ -255,7 +257,7 @@ def test_an_exception_in_inference_costs_one_frame(
     failing = frames(1)[0].copy()
     failing[0, 0] = FAILING
     bad = client.send(failing)
-    assert depth_bytes(play(client, frames(2))) == first  # the stream started anew
+    assert depth_bytes(play(client, frames(2))) == first  # the stream was reset
     assert not client.received[bad]
     lossless[0].wait_log(r"ERROR\].*/image: inference failed.*RuntimeError: the picture that must")
 
@@ -307,7 +309,7 @@ def test_range_limits_become_nan_in_depth_and_cloud(client: Client) -> None:
     assert client.set_parameter("max_depth", 0.0).successful
     expected = np.where((full >= near) & (full <= far), full, np.nan)
     assert np.array_equal(messages.decode_depth(result["depth/image"]), expected, equal_nan=True)
-    assert np.array_equal(messages.cloud_points(result["points"])["z"], expected, equal_nan=True)
+    assert np.array_equal(cloud_points(result["points"])["z"], expected, equal_nan=True)
 
 
 @pytest.mark.parametrize(

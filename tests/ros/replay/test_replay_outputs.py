@@ -15,8 +15,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.voxel_grid import VoxelGrid
-from dyfn_core.stream.session import Geometry
+from dyfn_core.prediction import Prediction
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.poses import ODOMETRY, PoseError, open_poses
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
@@ -43,12 +44,13 @@ def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[Fr
     return found
 
 
-def perfect_up_to(scale: float, depth: np.ndarray) -> Geometry:
+def perfect_up_to(scale: float, depth: np.ndarray) -> Prediction[np.ndarray]:
     """What a model would say that is right up to this scale."""
     said = (depth / scale).astype(np.float32)
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
     points = np.stack([(u - 23.5) / 40 * said, (v - 17.5) / 40 * said, said], axis=-1)
-    return Geometry(points, said, np.isfinite(said), CAMERA)
+    normalised = normalize_intrinsics(CAMERA, said.shape)
+    return Prediction(points, said, np.isfinite(said), normalised, known_camera=CAMERA)
 
 
 @pytest.fixture

@@ -1,0 +1,110 @@
+"""The stage that turns relative depth into metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibration
+from dyfn_core.metric.ground import up_from_pitch
+from dyfn_core.metric.pairing import Pairing
+from dyfn_core.metric.references import Reference
+from dyfn_core.metric.scale import MetricScale, ScaleInForce, ScaleOptions, to_metres
+from dyfn_core.prediction import Frame, Prediction
+from dyfn_core.stream.options import StreamOptions
+from dyfn_core.stream.resets import ANOTHER_CLOCK
+from dyfn_core.stream.stages import StreamStage
+
+
+def scale_options(options: StreamOptions) -> ScaleOptions:
+    """The part of a stream's options that a MetricScale needs.
+
+    Raises:
+        ValueError: The source lacks what it needs, such as a camera_height above 0.
+    """
+    up = up_from_pitch(math.radians(options.camera_pitch))
+    return ScaleOptions(
+        source=options.metric_source,
+        metric_scale=options.metric_scale,
+        camera_height=options.camera_height,
+        up=(float(up[0]), float(up[1]), float(up[2])),
+        calibration=CalibrationOptions(
+            mode=options.calibration,
+            fit=options.calibration_fit,
+            seconds=options.calibration_seconds,
+            min_points=options.calibration_points,
+            rate=options.tracking_rate,
+            disagreement=options.reference_disagreement,
+        ),
+    )
+
+
+class MetricStage(StreamStage):
+    """Metres from a fixed scale, from measurements, or from the camera's height.
+
+    While a source is configured and has no scale yet, depth is withheld (all invalid) unless
+    `until_metric` asks for relative depth: one stream must not change its unit unnoticed.
+    """
+
+    saved_as = "calibration"
+
+    def __init__(self, options: Callable[[], StreamOptions]) -> None:
+        """options: Asked for at each frame; only the live ones may change."""
+        self._options = options
+        self._metric = MetricScale(scale_options(options()))
+        self._pairing: Pairing[Reference] = Pairing(options().reference_tolerance)
+        self.scale: ScaleInForce = self._metric.in_force(0.0)  # at the last frame
+
+    @property
+    def state(self) -> ScaleCalibration:
+        """See StreamStage."""
+        return self._metric.calibrator.state
+
+    def restore(self, state: ScaleCalibration | None) -> None:
+        """See StreamStage."""
+        self._metric.reset()
+        if state is not None:
+            self._metric.calibrator.state = state
+
+    def add_reference(self, stamp: float, reference: Reference) -> None:
+        """A measurement, any thread; it waits for the frame of its time."""
+        self._pairing.put(stamp, reference)
+
+    def started(self, reason: str | None) -> None:
+        """A new stream has a unit of its own: calibrations end, a fixed scale stays."""
+        self._metric.reset()
+        if reason in ANOTHER_CLOCK:
+            self._pairing.clear()
+
+    def after_prediction(
+        self, frame: Frame, prediction: Prediction[np.ndarray]
+    ) -> Prediction[np.ndarray]:
+        """See StreamStage."""
+        options, stamp = self._options(), frame.stamp or 0.0
+        if options.metric_scale != self._metric.options.metric_scale:
+            self._metric.options = replace(self._metric.options, metric_scale=options.metric_scale)
+        references = self._pairing.take(stamp)
+        self.scale = scale = self._metric.push(prediction, stamp, references)
+        if scale.map is None:
+            withheld = scale.source != "none" and options.until_metric == "withhold"
+            nothing = np.zeros_like(prediction.mask)
+            return replace(prediction, mask=nothing) if withheld else prediction
+        if scale.map.shift == 0:
+            return prediction.scaled(scale.map.scale)
+        points, depth, before = to_metres(prediction.points, prediction.depth, scale.map)
+        mask = prediction.mask & before
+        return replace(prediction, points=points, depth=depth, mask=mask, metric=True)
+
+    def problems(self) -> list[str]:
+        """See StreamStage."""
+        return [f"scale: {self.scale.warning}"] if self.scale.warning else []
+
+    def report(self) -> dict[str, str]:
+        """See StreamStage."""
+        values = {f"scale: {key}": value for key, value in self.scale.described().items()}
+        dropped = self._pairing.dropped + self._metric.calibrator.dropped
+        values.update({f"scale: not used, {k}": str(n) for k, n in sorted(dropped.items())})
+        return values

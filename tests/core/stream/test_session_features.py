@@ -1,0 +1,168 @@
+"""A session's features without ROS: scene cuts, metres, saving and loading."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dyfn_core.metric.references import PointReference
+from dyfn_core.prediction import Frame, Prediction
+from dyfn_core.stream.options import StreamOptions
+from dyfn_core.stream.saving import StateError, path_for
+from dyfn_core.stream.session import StreamSession
+from tests.support.pinhole import FOV_X, PinholeModel
+from tests.support.tiny_model import load_tiny
+
+
+def session_of(**options: Any) -> StreamSession:
+    return StreamSession(load_tiny(), StreamOptions(**options))
+
+
+def push(session: StreamSession, image: np.ndarray, stamp: float) -> Prediction[np.ndarray]:
+    return session.push(Frame(image, stamp))
+
+
+def picture(seed: int, height: int = 36, width: int = 48) -> np.ndarray:
+    coarse = np.random.default_rng(seed).integers(40, 216, (height // 4, width // 4, 3))
+    return coarse.repeat(4, 0).repeat(4, 1).astype(np.uint8)
+
+
+def test_a_scene_cut_resets_the_stream_and_is_off_at_zero() -> None:
+    session, still = session_of(scene_cut_threshold=0.5), session_of(scene_cut_threshold=0.0)
+    for seed, stamp in ((0, 0.0), (0, 0.1), (1, 0.2), (1, 0.3)):
+        push(session, picture(seed), stamp)
+        push(still, picture(seed), stamp)
+    assert session.resets == {"scene cut": 1}
+    assert not still.resets
+    assert session.stream.memory.frames == 2
+
+
+def test_reference_gives_metres_after_its_first_second_until_the_next_reset() -> None:
+    session = session_of(metric_source="reference", scene_cut_threshold=0.0)
+    relative = session_of(scene_cut_threshold=0.0)
+    for step in range(13):
+        stamp = 5 + step / 10
+        plain = push(relative, picture(0), stamp)
+        rows, columns = np.nonzero(plain.valid)
+        points = 3.0 * plain.points[rows[::40], columns[::40]]
+        session.add_reference(stamp, PointReference(points))
+        found = push(session, picture(0), stamp)
+        if step < 10:
+            assert not found.metric
+            assert not found.valid.any()
+    assert found.metric
+    np.testing.assert_allclose(found.depth[found.valid], 3 * plain.depth[found.valid], rtol=0.05)
+    assert session.scale.map.scale == pytest.approx(3, rel=0.05)
+    assert session.report()["scale: unit"] == "metres"
+    session.request_reset()
+    assert not push(session, picture(0), 6.3).metric
+    assert "no measurement yet" in session.problems()[0]
+
+
+def test_stale_and_early_measurements_are_counted() -> None:
+    session = session_of(metric_source="reference", scene_cut_threshold=0.0)
+    for stamp in (1.0, 50.0):
+        session.add_reference(stamp, PointReference(np.ones((3, 3))))
+    push(session, picture(0), 5.0)
+    report = session.report()
+    assert report["scale: not used, stale"] == "1"
+    assert report["scale: not used, future-dated"] == "1"
+
+
+def test_the_camera_s_height_over_a_floor_gives_metres() -> None:
+    """A floor 0.5 units below a level camera that is 1.5 m above it."""
+    model = PinholeModel()
+    height, width, low = 48, 64, 0.5
+    focal = width / 2 / np.tan(np.radians(FOV_X / 2))
+    rows = np.arange(height) - (height - 1) / 2
+    depth = np.clip(low * focal / np.maximum(rows, 1e-3), 0.5, 1.5)
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = np.round((depth[:, None] - 0.5) * 255)
+    options = StreamOptions(
+        metric_source="camera_height",
+        camera_height=1.5,
+        calibration_points=2,
+        calibration_seconds=0.01,
+    )
+    session = StreamSession(model, options)
+    for index in range(4):
+        found = push(session, image, index / 10)
+    assert found.metric
+    assert session.scale.map is not None
+    assert session.scale.map.scale == pytest.approx(3.0, rel=0.1)
+
+
+def test_loaded_state_gives_the_bytes_of_a_stream_that_never_stopped(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    session = session_of(metric_source="fixed", metric_scale=2.0)
+    for seed in range(3):
+        push(session, picture(0 if seed < 2 else 5), seed / 10)
+    assert "saved 1 frames" in session.save(str(path))  # since the cut
+    expected = [push(session, picture(5), 0.3 + step / 10).depth for step in range(3)]
+
+    other = session_of(metric_source="fixed", metric_scale=2.0)
+    other.load(str(path))
+    found = [push(other, picture(5), 1000 + step / 10).depth for step in range(3)]
+    for one, two in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert not other.resets
+
+
+def test_a_frame_from_before_the_load_does_not_touch_the_loaded_state(tmp_path: Path) -> None:
+    session = session_of(scene_cut_threshold=0.0)
+    push(session, picture(0), 0.0)
+    session.save(str(tmp_path / "s"))
+    expected = push(session, picture(1), 0.1).depth
+    before = session.asked
+    session.load(str(tmp_path / "s"))
+    session.push(Frame(picture(2), 0.2), before)
+    np.testing.assert_array_equal(push(session, picture(1), 0.3).depth, expected)
+
+
+def test_a_calibration_and_the_last_image_come_back_with_the_state(tmp_path: Path) -> None:
+    options = {"metric_source": "reference", "calibration_seconds": 0.1}
+    session, path = session_of(**options), str(tmp_path / "s")
+    for stamp in (0.0, 0.1, 0.2):
+        points = session_of().push(Frame(picture(0))).points.reshape(-1, 3)
+        points = 3.0 * points[np.isfinite(points).all(1)][::40]
+        session.add_reference(stamp, PointReference(points))
+        found = push(session, picture(0), stamp)
+    assert found.metric
+    session.save(path)
+    other = session_of(**options)
+    other.load(path)
+    resumed = push(other, picture(0), 50.0)
+    assert resumed.metric and resumed.reset is None
+    np.testing.assert_array_equal(resumed.depth, push(session, picture(0), 0.3).depth)
+    other.load(path)
+    assert push(other, picture(5), 60.0).reset == "scene cut"
+
+
+def test_state_that_does_not_fit_the_camera_is_refused(tmp_path: Path) -> None:
+    session, path = session_of(), tmp_path / "s"
+    with pytest.raises(StateError, match="nothing to save yet"):
+        session.save(str(path))
+    push(session, picture(0), 0.0)
+    session.save(str(path))
+    with pytest.raises(StateError, match="older file is kept"):
+        session.save(str(tmp_path / "no" / "s"))
+    with pytest.raises(StateError, match="state_file is empty"):
+        session.save("")
+    large = session_of()
+    push(large, picture(0, 40, 60), 0.0)
+    with pytest.raises(StateError, match="for images of 48 x 36 pixels, the camera's have 60 x 40"):
+        large.load(str(path))
+    with pytest.raises(StateError, match="saved with stabilize = True"):
+        session_of(stabilize=False).load(str(path))
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(StateError, match="damaged"):
+        session.load(str(path))
+
+
+def test_cameras_that_share_a_path_have_files_of_their_own() -> None:
+    assert path_for("/a/s.safetensors", "front", True) == "/a/s.front.safetensors"
+    assert path_for("/a/s.safetensors", "front", False) == "/a/s.safetensors"
+    assert path_for("", "front", True) == ""
