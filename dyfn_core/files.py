@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,20 +13,36 @@ class OutputError(OSError):
 
 
 @contextmanager
-def finished_file(path: Path) -> Iterator[Path]:
-    """A name to write to, which becomes `path` at the end, and is removed after an exception.
+def finished_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """A name to write to, which becomes `path` at the end and is removed after an exception.
 
-    An older file at `path` stays until then. Raises OutputError for an OSError.
+    An older file at `path` stays until then. Several processes may write one file at once: each
+    writes under a name of its own, and the last one to finish wins.
+
+    Args:
+        path: the file to write.
+        durable: flush the content to the disk before the file takes its name, so that a loss of
+            power leaves the old file or the new one.
+
+    Raises:
+        OutputError: for an OSError; it names the file.
     """
-    partial = path.with_name(f".{path.name}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield partial
+        if durable:
+            _flush(partial)
         partial.replace(path)
     except BaseException as error:
         partial.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise cannot_write(path, error) from error
         raise
+
+
+def _flush(path: Path) -> None:
+    with path.open("rb+") as file:
+        os.fsync(file.fileno())
 
 
 def cannot_write(path: Path, error: OSError) -> OutputError:

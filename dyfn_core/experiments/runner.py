@@ -18,6 +18,7 @@ from dyfn_core.evaluation.variants import (
     score_stabilizer,
 )
 from dyfn_core.experiments.declared import Arm
+from dyfn_core.files import finished_file
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFNConfig
@@ -190,6 +191,5 @@ def _digest(config: StabilizerRunConfig) -> str:
 
 def _write_json(path: Path, values: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(values, indent=1) + "\n")
-    partial.replace(path)
+    with finished_file(path) as partial:
+        partial.write_text(json.dumps(values, indent=1) + "\n")

@@ -14,7 +14,6 @@ import json
 import logging
 import os
 import re
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from importlib.resources import as_file, files
@@ -26,6 +25,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from dyfn_core.files import finished_file
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.depth_anything import DepthAnythingModel, official_encoder
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
@@ -198,16 +198,9 @@ def save_model(
         "format": f"{FORMAT} 1",
         "config": json.dumps(full_config(model), sort_keys=True),
     }
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".partial")
-    os.close(handle)
-    try:
-        save_file(weights, temporary, metadata)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with finished_file(Path(path)) as partial:
+        save_file(weights, partial, metadata)
+        partial.chmod(0o644)  # safetensors makes files for their owner alone
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dyfn_core.files import finished_file
+
 
 @dataclass(frozen=True)
 class CloudError:
@@ -56,6 +58,5 @@ def write_ply(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
     import trimesh  # slow to import
 
     cloud = trimesh.PointCloud(points, colours)
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_bytes(cloud.export(file_type="ply"))
-    partial.replace(path)
+    with finished_file(path) as partial:
+        partial.write_bytes(cloud.export(file_type="ply"))
