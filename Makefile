@@ -18,7 +18,7 @@ $(READY): pyproject.toml setup.py setup.cfg
 	touch $@
 
 demo: $(READY)
-	$(BIN)/dyfn-demo --recording bags/demo --out out/demo
+	$(BIN)/dyfn-demo bags/demo --out out/demo
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -1,31 +1,77 @@
-"""Streaming monocular geometry that keeps its scale (no ROS in here)."""
+"""Streaming monocular geometry: frames of one camera in, point maps that keep one scale out.
+
+    >>> import numpy as np
+    >>> from dyfn_core import DepthStream, load_model
+    >>> stream = DepthStream(load_model("dyfn-mini"))
+    >>> prediction = stream.push(np.zeros((48, 64, 3), np.uint8), stamp=0.0)
+    >>> prediction.depth.shape
+    torch.Size([48, 64])
+
+No ROS dependency; the package dyfn_ros has the ROS 2 node and the recordings.
+"""
 
 from typing import TYPE_CHECKING, Any
 
+# Read by type checkers, IDEs and pydoc only: see __getattr__.
 if TYPE_CHECKING:
+    from dyfn_core.models import CheckpointError as CheckpointError
     from dyfn_core.models import load_model as load_model
     from dyfn_core.models import save_model as save_model
     from dyfn_core.prediction import Frame as Frame
     from dyfn_core.prediction import Prediction as Prediction
     from dyfn_core.prediction import StreamState as StreamState
     from dyfn_core.stream.depth_stream import DepthStream as DepthStream
+    from dyfn_core.stream.depth_stream import push_together as push_together
+
+    __version__: str
 
 _HOMES = {
-    "load_model": "dyfn_core.models",
-    "save_model": "dyfn_core.models",
+    "CheckpointError": "dyfn_core.models",
+    "DepthStream": "dyfn_core.stream.depth_stream",
     "Frame": "dyfn_core.prediction",
     "Prediction": "dyfn_core.prediction",
     "StreamState": "dyfn_core.prediction",
-    "DepthStream": "dyfn_core.stream.depth_stream",
+    "load_model": "dyfn_core.models",
+    "push_together": "dyfn_core.stream.depth_stream",
+    "save_model": "dyfn_core.models",
 }
 
-__all__ = ["DepthStream", "Frame", "Prediction", "StreamState", "load_model", "save_model"]
+__all__ = [
+    "CheckpointError",
+    "DepthStream",
+    "Frame",
+    "Prediction",
+    "StreamState",
+    "__version__",
+    "load_model",
+    "push_together",
+    "save_model",
+]
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: importing a small part of the package must not cost the seconds of the models.
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
+    # On first use: the models import torch, two seconds that `dyfn-train --help`, a recording
+    # worker or dyfn_core.files must not pay.
+    if name == "__version__":
+        value: Any = _version()
+    elif name in _HOMES:
+        from importlib import import_module
 
-    return getattr(import_module(_HOMES[name]), name)
+        value = getattr(import_module(_HOMES[name]), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("dyfn_ros")  # the distribution that holds all three packages
+    except PackageNotFoundError:  # a source tree on the path, not installed
+        return "0+unknown"

@@ -3,35 +3,48 @@
 from __future__ import annotations
 
 import argparse
+import math
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+_Number = TypeVar("_Number", int, float)
+
+
+def _parsed(
+    text: str, kind: Callable[[str], _Number], allowed: Callable[[_Number], bool], expected: str
+) -> _Number:
+    try:
+        value = kind(text)
+    except ValueError:
+        value = None
+    if value is None or not allowed(value):
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}")
+    return value
 
 
 def at_least_one(text: str) -> int:
     """A whole number, 1 or more."""
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text} must be at least 1")
-    return value
+    return _parsed(text, int, lambda value: value >= 1, "a whole number of 1 or more")
 
 
 def not_negative(text: str) -> int:
     """A whole number, 0 or more."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} must not be negative")
-    return value
+    return _parsed(text, int, lambda value: value >= 0, "a whole number of 0 or more")
 
 
 def above_zero(text: str) -> float:
     """A number above 0, also infinity: no limit."""
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text} must be above 0")
-    return value
+    return _parsed(text, float, lambda value: value > 0, "a number above 0")
 
 
 def finite_above_zero(text: str) -> float:
     """As above_zero, without infinity."""
-    value = above_zero(text)
-    if value == float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} must be above 0")
-    return value
+    return _parsed(text, float, lambda value: 0 < value < math.inf, "a finite number above 0")
+
+
+def device_name(text: str) -> str:
+    """A name that models.resolve_device may know; whether it is here shows when it is used."""
+    if not re.fullmatch(r"auto|cpu|(cuda|mps|xpu)(:\d+)?", text):
+        raise argparse.ArgumentTypeError(f"expected auto, cpu, cuda or cuda:N, got {text!r}")
+    return text

@@ -4,40 +4,137 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NoReturn
 
 from tqdm import tqdm
 
 from dyfn_worlds.generate import MapWorlds, RoomWorlds, ShardJob, render
 
-
-def parse_arguments(argv: list[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="dyfn-worlds", description=__doc__)
-    parser.add_argument("--assets", type=Path, required=True, help="folder that holds the art")
-    parser.add_argument("--worlds", choices=("maps", "rooms"), default="maps")
-    parser.add_argument("--out", type=Path, required=True, help="folder of shards to add to")
-    parser.add_argument("--shards", type=int, default=100, help="shards to render")
-    parser.add_argument("--views", type=int, default=24, help="independent views in a shard")
-    parser.add_argument("--clip-frames", type=int, default=0, help="render clips of this length")
-    parser.add_argument("--clip-fps", type=float, default=5.0, help="frames a second of a clip")
-    parser.add_argument("--seed", type=int, default=0, help="first seed; a shard has one each")
-    parser.add_argument("--size", default="240x320", help="HEIGHTxWIDTH in pixels")
-    return parser.parse_args(argv)
+UNUSABLE, INTERRUPTED = 2, 130
 
 
-def main(argv: list[str] | None = None) -> int:
-    options = parse_arguments(argv)
-    height, width = (int(x) for x in options.size.split("x"))
-    size = (height, width)
+class _Parser(argparse.ArgumentParser):
+    """As dyfn_core.cli.arguments has it, of which this package knows nothing."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(UNUSABLE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def _size(text: str) -> tuple[int, int]:
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH such as 240x320, got {text!r}")
+    return int(height), int(width)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"expected a whole number of 0 or more, got {text!r}")
+    return int(text)
+
+
+def _rate(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a finite number above 0, got {text!r}")
+    return value
+
+
+def _version() -> str:
+    try:
+        return version("dyfn_ros")  # the distribution that holds this package
+    except PackageNotFoundError:
+        return "0+unknown"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = _Parser(
+        prog="dyfn-worlds",
+        description="Render training worlds with exact depth, intrinsics and poses.",
+        epilog="Exit code: 0 all shards are written, 2 bad arguments or unusable art.",
+    )
+    parser.add_argument(
+        "--version",
+        action="version",
+        version=f"dyfn-worlds {_version()}",
+        help="print the version and exit",
+    )
+    add = parser.add_argument_group("worlds").add_argument
+    add("--assets", type=Path, required=True, metavar="DIR", help="folder that holds the art")
+    add(
+        "--worlds",
+        choices=("maps", "rooms"),
+        default="maps",
+        help="maps: Quake levels; rooms: furnished rooms (default: maps)",
+    )
+    add("--seed", type=_count, default=0, metavar="N", help="seed of the first shard (default: 0)")
+    add = parser.add_argument_group("output").add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder of shards to add to")
+    add("--shards", type=_count, default=100, metavar="N", help="shards to render (default: 100)")
+    add(
+        "--views",
+        type=_count,
+        default=24,
+        metavar="N",
+        help="independent views per shard (default: 24)",
+    )
+    add(
+        "--clip-frames",
+        type=_count,
+        default=0,
+        metavar="N",
+        help="render clips of N frames instead of views (default: 0, views)",
+    )
+    add(
+        "--clip-fps",
+        type=_rate,
+        default=5.0,
+        metavar="X",
+        help="frames per second of a clip (default: 5)",
+    )
+    add(
+        "--size",
+        type=_size,
+        default=(240, 320),
+        metavar="HEIGHTxWIDTH",
+        help="image size in pixels (default: 240x320)",
+    )
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """-> exit code."""
+    options = parser().parse_args(argv)
+    try:
+        _render(options)
+    except (OSError, ValueError, ImportError) as error:
+        print(f"dyfn-worlds: {error}", file=sys.stderr)
+        return UNUSABLE
+    except KeyboardInterrupt:
+        print("dyfn-worlds: interrupted; the finished shards stay", file=sys.stderr)
+        return INTERRUPTED
+    return 0
+
+
+def _render(options: argparse.Namespace) -> None:
     job = ShardJob(
         options.worlds,
         options.shards,
         options.views,
         options.clip_frames,
         options.seed,
-        size,
+        options.size,
         options.clip_fps,
     )
+    if not options.assets.is_dir():
+        raise NotADirectoryError(f"--assets {options.assets}: no such folder")
     kind = MapWorlds if options.worlds == "maps" else RoomWorlds
     worlds: MapWorlds | RoomWorlds = kind(options.assets)
     with tqdm(total=options.shards, unit="shard", file=sys.stderr) as bar:
@@ -47,7 +144,6 @@ def main(argv: list[str] | None = None) -> int:
             bar.set_postfix_str(line[-60:])
 
         render(job, worlds, options.out, report)
-    return 0
 
 
 if __name__ == "__main__":

@@ -5,6 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyfn_core.cli.arguments import (
+    add_device,
+    add_max_frames,
+    add_model,
+    add_num_tokens,
+    add_out,
+    add_start,
+    add_stride,
+)
 from dyfn_core.data.datasets import RENDERED
 from dyfn_core.data.frames import DataError, FrameSequence
 from dyfn_core.data.pool import DataSpec, open_pool, resolve
@@ -12,17 +21,29 @@ from dyfn_core.data.pool import DataSpec, open_pool, resolve
 
 def add_data_arguments(parser: argparse.ArgumentParser) -> None:
     """Which data and frames, which model, and where the results go."""
-    add = parser.add_argument
-    add("data", metavar="[KIND=]PATH", help="RGB-D folder, recording or data set with depth")
-    add("--sequence", help="name (or its end) of one sequence; default: the first")
-    add("--split", default="held_out", help="of rendered folders: held_out or train")
-    add("--start", type=int, default=0, help="first frame, counted from 0")
-    add("--stride", type=int, default=1, help="take every N-th frame")
-    add("--max-frames", type=int, help="stop after so many")
-    add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
-    add("--num-tokens", type=int, help="resolution inside the model")
-    add("--device", default="cpu", help="cpu, cuda, cuda:N")
-    add("--out", type=Path, required=True, help="folder for the results")
+    parser.add_argument(
+        "data", metavar="[KIND=]PATH", help="RGB-D folder, recording or data set with depth"
+    )
+    add_out(parser)
+    group = parser.add_argument_group("frames")
+    group.add_argument(
+        "--sequence",
+        metavar="NAME",
+        help="one sequence, by its name or its end (default: the first)",
+    )
+    group.add_argument(
+        "--split",
+        default="held_out",
+        choices=("held_out", "train"),
+        help="split of rendered folders (default: held_out)",
+    )
+    add_start(group)
+    add_stride(group)
+    add_max_frames(group)
+    group = parser.add_argument_group("model")
+    add_model(group)
+    add_num_tokens(group)
+    add_device(group)
 
 
 def open_sequence(options: argparse.Namespace) -> FrameSequence:
@@ -42,13 +63,8 @@ def open_sequence(options: argparse.Namespace) -> FrameSequence:
 
 
 def places(options: argparse.Namespace, length: int) -> range:
-    """Which frames to take. Raises ValueError when an option is out of range or none is left."""
-    for name, low in (("start", 0), ("stride", 1), ("max_frames", 1)):
-        value = getattr(options, name)
-        if value is not None and value < low:
-            raise ValueError(f"--{name.replace('_', '-')} must be at least {low}, got {value}")
-    chosen = range(options.start, length, options.stride)
-    chosen = chosen[: options.max_frames]
+    """Which of `length` frames to take. Raises ValueError when --start leaves none."""
+    chosen = range(options.start or 0, length, options.stride)[: options.max_frames]
     if not chosen:
         raise ValueError(f"--start {options.start} is behind the last of {length} frames")
     return chosen

@@ -1,8 +1,4 @@
-"""dyfn-eval: score a model, or any method's files; rebuild scenes; study the latent.
-
-Exit status: 0 everything was scored; 3 something of the benchmark was missing or could not be
-scored, and --allow-missing let the rest go on; 2 nothing could be scored, or bad arguments.
-"""
+"""dyfn-eval: score a model, or any method's files; rebuild scenes; study the latent."""
 
 from __future__ import annotations
 
@@ -14,8 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dyfn_core.argument_types import at_least_one
 from dyfn_core.cli import reconstruct, study
-from dyfn_core.cli.eval_arguments import add_benchmark, add_model, add_predictions
+from dyfn_core.cli.arguments import Commands, command_parser, described
+from dyfn_core.cli.eval_arguments import add_benchmark, add_predictions, add_run
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.long_sequence import (
     LENGTHS,
@@ -47,7 +45,7 @@ COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
         command: Callable[[argparse.Namespace], int] = options.run
         return command(options)
@@ -87,7 +85,7 @@ def _model(options: argparse.Namespace) -> Method:
     return ModelMethod(
         options.name or Path(options.model).stem,
         load_model(options.model, options.device),
-        stabilize=options.stabilizer,
+        stabilize=options.stabilize,
         controls=options.controls,
         num_tokens=options.num_tokens,
         known_camera=options.known_camera,
@@ -107,12 +105,12 @@ def _method(options: argparse.Namespace) -> Method:
 def _open(options: argparse.Namespace, frames: int | None = None) -> Opened:
     """The benchmark with what the command line overrides."""
     known = benchmark(options.benchmark)
-    settings = default_settings(known, find_layout(known, options.root, options.layout))
+    settings = default_settings(known, find_layout(known, options.data, options.layout))
     crop = None if options.crop is None else tuple(options.crop)
     given: dict[str, Any] = {
-        "first": options.first,
+        "first": options.start,
         "stride": options.stride,
-        "frames": options.frames if frames is None else frames,
+        "frames": options.max_frames if frames is None else frames,
         "depth_max": options.depth_max,
         "crop": crop,
     }
@@ -121,7 +119,7 @@ def _open(options: argparse.Namespace, frames: int | None = None) -> Opened:
         settings = replace(settings, frames=None)
     opened = open_benchmark(
         options.benchmark,
-        options.root,
+        options.data,
         settings,
         layout=options.layout,
         sequences=options.sequences,
@@ -199,46 +197,69 @@ def _note(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="dyfn-eval", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(
+        "dyfn-eval",
+        "Score a model, or any method's files; rebuild scenes; study the latent.",
+        "Exit status: 0 everything was scored; 3 part of the benchmark was missing or could not "
+        "be scored, and --allow-missing let the rest go on; 2 nothing could be scored, or bad "
+        "arguments.",
     )
-    commands = parser.add_subparsers(dest="command", required=True)
-    command = commands.add_parser("list", help="the benchmarks: layout, frames, cap, crop")
-    command.set_defaults(run=_list)
-    command = commands.add_parser("run", help="score a model, with its controls")
-    add_benchmark(command)
-    add_model(command, required=True)
-    _add_tables(command)
-    command = commands.add_parser("score", help="score predictions from files")
-    add_benchmark(command)
-    add_predictions(command, required=True)
-    _add_tables(command)
-    command = commands.add_parser(
-        "long", help="error against length, the alignment solved anew at every length"
-    )
-    add_benchmark(command)
-    source = command.add_argument_group("what is scored (one of --model and --predictions)")
-    either = source.add_mutually_exclusive_group(required=True)
-    either.add_argument("--model", help="checkpoint, Hub id or dyfn-mini")
-    either.add_argument("--predictions", type=Path, metavar="DIR", help="see dyfn-eval score")
-    add_model(command, required=False)
-    add_predictions(command, required=False)
-    command.add_argument(
-        "--lengths", type=int, nargs="+", metavar="N", help="frames (default: 100 200 300 400 500)"
-    )
-    command.set_defaults(run=_long)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_list(commands)
+    _add_scored(commands)
+    _add_long(commands)
     reconstruct.add_parser(commands)
     study.add_parser(commands)
     return parser
 
 
+def _add_list(commands: Commands) -> None:
+    text = "print the benchmarks: layout, frames, cap, crop"
+    commands.add_parser("list", help=text, description=described(text)).set_defaults(run=_list)
+
+
+def _add_scored(commands: Commands) -> None:
+    text = "score a model, with its controls"
+    command = commands.add_parser("run", help=text, description=described(text))
+    add_benchmark(command)
+    add_run(command)
+    _add_tables(command)
+    text = "score predictions from files"
+    command = commands.add_parser("score", help=text, description=described(text))
+    add_benchmark(command)
+    add_predictions(command)
+    _add_tables(command)
+
+
+def _add_long(commands: Commands) -> None:
+    text = "error against length, the alignment solved again at every length"
+    command = commands.add_parser("long", help=text, description=described(text))
+    add_benchmark(command)
+    source = command.add_argument_group("what is scored (one of --model and --predictions)")
+    either = source.add_mutually_exclusive_group(required=True)
+    add_run(command, either)
+    add_predictions(command, either)
+    command.add_argument(
+        "--lengths",
+        type=at_least_one,
+        nargs="+",
+        metavar="N",
+        help=f"frames (default: {' '.join(map(str, LENGTHS))})",
+    )
+    command.set_defaults(run=_long)
+
+
 def _add_tables(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("tables")
     group.add_argument(
-        "--no-temporal", dest="temporal", action="store_false", help="no TAE, no flicker"
+        "--temporal",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also compute TAE and flicker (default: %(default)s)",
     )
-    group.add_argument("--ablations", action="store_true", help="the paper's ablations too")
+    group.add_argument("--ablations", action="store_true", help="also print the paper's ablations")
     command.set_defaults(run=_evaluate)
 
 

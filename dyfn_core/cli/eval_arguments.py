@@ -5,6 +5,20 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dyfn_core.argument_types import above_zero, finite_above_zero, not_negative
+from dyfn_core.cli.arguments import (
+    Options,
+    add_controls,
+    add_device,
+    add_max_frames,
+    add_model,
+    add_num_tokens,
+    add_out,
+    add_stabilize,
+    add_start,
+    add_stride,
+    renamed,
+)
 from dyfn_core.evaluation.benchmarks.predictions import QUANTITIES
 from dyfn_core.evaluation.benchmarks.registry import AUTO, LAYOUTS
 from dyfn_core.scoring.protocols import FITS, L1
@@ -12,72 +26,108 @@ from dyfn_core.scoring.protocols import FITS, L1
 
 def add_benchmark(command: argparse.ArgumentParser) -> None:
     """What is scored of which data set, and how."""
-    command.add_argument("--benchmark", required=True, help="a name of `dyfn-eval list`")
-    command.add_argument("--root", type=Path, required=True, help="folder of the data set")
-    command.add_argument("--out", type=Path, required=True, help="folder for the results")
-    command.add_argument("--name", help="of the method in tables")
-    group = command.add_argument_group("what is scored of it (default: as in the paper)")
-    group.add_argument("--layout", choices=LAYOUTS, default=AUTO, help="default: found out")
-    group.add_argument("--sequences", nargs="+", default=[], metavar="NAME", help="only these")
-    group.add_argument("--allow-missing", action="store_true", help="score what is there")
-    group.add_argument("--first", type=int, help="frames left out at the start")
-    group.add_argument("--stride", type=int, help="every so-many-th frame")
-    group.add_argument("--frames", type=int, help="at most so many of a sequence")
-    group.add_argument("--all-frames", action="store_true", help="no limit")
-    group.add_argument("--depth-max", type=float, metavar="METRES", help="cap of the truth")
+    group = command.add_argument_group("benchmark and results")
     group.add_argument(
-        "--crop", type=int, nargs=2, metavar=("ROWS", "COLUMNS"), help="cut off at each side"
+        "--benchmark", required=True, metavar="NAME", help="a name that `dyfn-eval list` prints"
     )
-    group = command.add_argument_group("how it is scored")
+    data = group.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder of the data set"
+    )
+    renamed(group, "--root", data)
+    add_out(group)
+    group.add_argument("--name", help="name of the method in the tables")
+    group = command.add_argument_group("frames (default: as in the paper)")
     group.add_argument(
-        "--fit", choices=FITS, default=L1, help="alignment: weighted L1 (paper), least squares"
+        "--layout",
+        choices=LAYOUTS,
+        default=AUTO,
+        help="layout of the folder (default: auto, by what is in it)",
+    )
+    group.add_argument(
+        "--sequences", nargs="+", default=[], metavar="NAME", help="only these sequences"
+    )
+    group.add_argument(
+        "--allow-missing", action="store_true", help="score the sequences that are there"
+    )
+    renamed(group, "--first", add_start(group))
+    add_stride(group, None)
+    renamed(group, "--frames", add_max_frames(group))
+    group.add_argument("--all-frames", action="store_true", help="no limit on the number of frames")
+    group.add_argument(
+        "--depth-max", type=above_zero, metavar="METRES", help="cap of the ground truth, metres"
+    )
+    group.add_argument(
+        "--crop",
+        type=not_negative,
+        nargs=2,
+        metavar=("ROWS", "COLUMNS"),
+        help="pixels cut off above and below, and at the left and right",
+    )
+    group = command.add_argument_group("scores")
+    group.add_argument(
+        "--fit",
+        choices=FITS,
+        default=L1,
+        help=f"alignment: weighted L1 as in the paper, or least squares (default: {L1})",
     )
     group.add_argument(
         "--all-pixels",
         action="store_true",
-        help="every pixel, in memory that grows; default: a grid of at most 20000 a frame",
+        help="use every pixel, which takes memory; default: a grid of at most 20000 per frame",
     )
 
 
-def add_model(command: argparse.ArgumentParser, required: bool) -> None:
-    """A model that is run. required: --model is an option of the group, and needed."""
+def add_run(command: argparse.ArgumentParser, given: Options | None = None) -> None:
+    """A model that is run.
+
+    Args:
+        command: the sub-command.
+        given: where --model is added as an optional choice; None: it must be given.
+    """
     group = command.add_argument_group("model")
-    if required:
-        group.add_argument("--model", required=True, help="checkpoint, Hub id or dyfn-mini")
+    if given is None:
+        add_model(group, required=True)
+    else:
+        given.add_argument("--model", help="model to run: bundled name, checkpoint file, or Hub id")
+    add_stabilize(group)
+    add_controls(group, default=True)
+    add_num_tokens(group)
     group.add_argument(
-        "--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone"
+        "--known-camera", action="store_true", help="give the model the benchmark's intrinsics"
     )
-    group.add_argument(
-        "--no-controls",
-        dest="controls",
-        action="store_false",
-        help="leave out the moving average and the frozen statistics",
-    )
-    group.add_argument("--num-tokens", type=int, help="how finely to look")
-    group.add_argument(
-        "--known-camera", action="store_true", help="tell the model the benchmark's intrinsics"
-    )
-    group.add_argument("--device", default="cpu", help="of torch (default: cpu)")
+    add_device(group)
 
 
-def add_predictions(command: argparse.ArgumentParser, required: bool) -> None:
-    """Files that are read. required: --predictions is an option of the group, and needed."""
+def add_predictions(command: argparse.ArgumentParser, given: Options | None = None) -> None:
+    """Files that are read.
+
+    Args:
+        command: the sub-command.
+        given: where --predictions is added as an optional choice; None: it must be given.
+    """
     group = command.add_argument_group("predictions")
-    if required:
-        group.add_argument(
-            "--predictions",
-            type=Path,
-            required=True,
-            metavar="DIR",
-            help="SEQUENCE.npz, SEQUENCE.npy (T x H x W), or SEQUENCE/ with one .npz, .npy, 16-bit "
-            ".png or .exr a frame",
-        )
+    target = group if given is None else given
+    target.add_argument(
+        "--predictions",
+        type=Path,
+        required=given is None,
+        metavar="DIR",
+        help="SEQUENCE.npz, SEQUENCE.npy (T x H x W), or SEQUENCE/ with one .npz, .npy, 16-bit "
+        ".png or .exr per frame",
+    )
     group.add_argument(
         "--quantity",
         choices=QUANTITIES,
-        required=required,
-        default=None if required else QUANTITIES[0],
-        help="depth; disparity: a / depth + b; inverse: a / depth",
+        required=given is None,
+        default=None if given is None else QUANTITIES[0],
+        help="what the files hold. depth; disparity: a / depth + b; inverse: a / depth",
     )
-    group.add_argument("--scale", type=float, help="stored values per unit; needed for .png")
-    group.add_argument("--key", help="of the array in .npz files that hold several")
+    scale = group.add_argument(
+        "--depth-scale",
+        type=finite_above_zero,
+        dest="scale",
+        metavar="X",
+        help="stored values per unit; needed for .png",
+    )
+    renamed(group, "--scale", scale)
+    group.add_argument("--key", help="name of the array in .npz files that hold several")

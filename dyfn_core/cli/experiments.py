@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dyfn_core.argument_types import at_least_one
+from dyfn_core.cli.arguments import Commands, add_stride, described
 from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
 from dyfn_core.evaluation.variants import EncodedSequence, errors_by_length
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
@@ -30,29 +32,58 @@ from dyfn_core.training.loop.trainer import MODEL_FILE
 LENGTHS = (100, 200, 300, 400, 500)
 GRID_FRAMES = 24
 CONFIG = Path("config/train_experiments.yaml")
+OUT = Path("runs/experiments")
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """The sub-command and its options."""
-    command = commands.add_parser("experiments", help="the paper's claims, on a base of your own")
-    command.add_argument("name", nargs="*", help="experiments (default: all); see --list")
-    command.add_argument("--list", action="store_true", help="print the experiments and stop")
-    command.add_argument("--config", type=Path, default=CONFIG, help="settings of every run")
-    command.add_argument("--base", help="model whose DyFN is trained; instead of the config's")
-    command.add_argument("--out", type=Path, default=Path("runs/experiments"), help="all runs")
-    command.add_argument("--seeds", type=int, default=3, help="runs of each arm")
-    command.add_argument("--write", type=Path, help="Markdown file to put the tables in")
-    command.add_argument(
-        "--recording", type=Path, action="append", default=[], help="folder with rgb/ and depth/"
+    text = "the paper's claims, on a base of your own"
+    command = commands.add_parser("experiments", help=text, description=described(text))
+    add = command.add_argument
+    add("name", nargs="*", help="experiments to run (default: all); see --list")
+    add("--list", action="store_true", help="print the experiments and stop")
+    add(
+        "--config",
+        type=Path,
+        default=CONFIG,
+        metavar="FILE",
+        help=f"settings of every run (default: {CONFIG})",
     )
-    command.add_argument("--clips", type=int, default=12, help="held-out clips to score on")
-    command.add_argument("--stride", type=int, default=4, help="score every so-many-th frame")
-    command.add_argument(
-        "--lengths", type=int, nargs="+", default=list(LENGTHS), help="of long-sequences"
+    add("--base", metavar="MODEL", help="model whose DyFN is trained, instead of the config's")
+    add(
+        "--out",
+        type=Path,
+        default=OUT,
+        metavar="DIR",
+        help=f"folder for all runs (default: {OUT})",
     )
-    command.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
+    add("--seeds", type=at_least_one, default=3, metavar="N", help="runs per arm (default: 3)")
+    add("--write", type=Path, metavar="FILE", help="Markdown file to put the tables in")
+    add(
+        "--recording",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="RGB-D folder to score on; may be given several times",
     )
+    add(
+        "--clips",
+        type=at_least_one,
+        default=12,
+        metavar="N",
+        help="held-out clips to score on (default: 12)",
+    )
+    add_stride(command, 4)
+    add(
+        "--lengths",
+        type=at_least_one,
+        nargs="+",
+        default=list(LENGTHS),
+        metavar="N",
+        help=f"frames, for long-sequences (default: {' '.join(map(str, LENGTHS))})",
+    )
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -61,8 +92,6 @@ def run(options: argparse.Namespace) -> None:
         for experiment in EXPERIMENTS:
             print(f"{experiment.name:18} {experiment.question}")
         return
-    if options.seeds < 1 or options.stride < 1:
-        raise ValueError("--seeds and --stride must be at least 1")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     chosen = find_experiments(options.name)
     base = [f"base={options.base}"] if options.base else []

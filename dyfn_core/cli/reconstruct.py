@@ -11,6 +11,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from dyfn_core.argument_types import at_least_one, finite_above_zero, not_negative
+from dyfn_core.cli.arguments import Commands
 from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
 from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
 from dyfn_core.evaluation.reconstruction.matching import build_matcher
@@ -40,24 +42,59 @@ from dyfn_core.models.checkpoints import load_model
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """The sub-command and its options; its function is in `run`."""
     command = commands.add_parser(
         "reconstruct",
         help="poses and a fused cloud from predicted point maps",
-        description=__doc__,
+        description="Poses and a fused cloud, with and without DyFN and from true depth.",
         epilog="Exit status: 0 done, 3 frames could not be read (the rest was used), 2 unusable.",
     )
     add_data_arguments(command)
-    add = command.add_argument
-    add("--matcher", default="dis+sift", help="dis, sift, akaze, orb, or several with +")
-    add("--offsets", type=int, nargs="+", default=list(OFFSETS), help="frames back to match with")
-    add("--threshold", type=float, default=0.05, help="of an inlier, as a share of its depth")
+    add = command.add_argument_group("matching and poses").add_argument
+    add(
+        "--matcher",
+        default="dis+sift",
+        help="dis, sift, akaze, orb, or several with + (default: dis+sift)",
+    )
+    add(
+        "--offsets",
+        type=at_least_one,
+        nargs="+",
+        default=list(OFFSETS),
+        metavar="N",
+        help=f"match with the frames N earlier (default: {' '.join(map(str, OFFSETS))})",
+    )
+    add(
+        "--threshold",
+        type=finite_above_zero,
+        default=0.05,
+        metavar="X",
+        help="largest residual of an inlier, as a share of its depth (default: 0.05)",
+    )
     add("--with-scale", action="store_true", help="similarity instead of rigid poses")
-    add("--voxel", type=float, default=0.01, help="edge, as a share of the first median depth")
-    add("--seed", type=int, default=0, help="of RANSAC")
-    add("--tolerance", type=float, default=0.05, help="metres, for precision and recall")
-    add("--no-true-depth", dest="true_depth", action="store_false", help="leave the bound out")
+    add("--seed", type=not_negative, default=0, metavar="N", help="seed of RANSAC (default: 0)")
+    add = command.add_argument_group("cloud").add_argument
+    add(
+        "--voxel",
+        type=finite_above_zero,
+        default=0.01,
+        metavar="X",
+        help="edge of a voxel, as a share of the first frame's median depth (default: 0.01)",
+    )
+    add(
+        "--tolerance",
+        type=finite_above_zero,
+        default=0.05,
+        metavar="METRES",
+        help="distance of a matched point, for precision and recall (default: 0.05)",
+    )
+    add(
+        "--true-depth",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="also rebuild from the true depth, as a bound (default: %(default)s)",
+    )
     add("--no-model", dest="with_model", action="store_false", help="true depth alone")
     command.set_defaults(run=run)
 

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from dyfn_core.argument_types import at_least_one, finite_above_zero
+from dyfn_core.cli.arguments import Commands
 from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
 from dyfn_core.data.frames import FrameError, FrameSequence
 from dyfn_core.evaluation.empirical_study import (
@@ -27,25 +29,37 @@ COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
 FRAMES = 24
 
 
-def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def add_parser(commands: Commands) -> None:
     """The sub-command and its options; its function is in `run`."""
     command = commands.add_parser(
         "study",
         help="scale the latent's statistics and see what moves",
-        description=__doc__,
+        description="The paper's empirical study on the frames of any data, for any model.",
         epilog="Exit status: 0 done, 3 frames could not be read (the rest was used), 2 unusable.",
     )
     add_data_arguments(command)
-    add = command.add_argument
-    add("--frames", type=int, default=FRAMES, help="at most so many, evenly spaced")
-    add("--factors", type=float, nargs="+", default=list(FACTORS), help="of mean and deviation")
+    add = command.add_argument_group("study").add_argument
+    add(
+        "--frames",
+        type=at_least_one,
+        default=FRAMES,
+        metavar="N",
+        help=f"study N of the frames, evenly spaced (default: {FRAMES})",
+    )
+    add(
+        "--factors",
+        type=finite_above_zero,
+        nargs="+",
+        default=list(FACTORS),
+        metavar="X",
+        help="factors of mean and deviation "
+        f"(default: {' '.join(f'{factor:g}' for factor in FACTORS)})",
+    )
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """-> exit status. Raises ValueError, DataError or OSError for what cannot be used."""
-    if options.frames < 1:
-        raise ValueError(f"--frames must be at least 1, got {options.frames}")
     sequence = open_sequence(options)
     chosen = places(options, len(sequence))
     spread = np.unique(np.linspace(0, len(chosen) - 1, options.frames).round().astype(int))

@@ -12,7 +12,9 @@ from typing import Any
 
 import yaml
 
+from dyfn_core.argument_types import at_least_one
 from dyfn_core.cli import experiments
+from dyfn_core.cli.arguments import add_stride, command_parser, described
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
 from dyfn_core.evaluation.variants import score_variants, variant_table
@@ -47,7 +49,7 @@ FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    options = _parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
         if options.command == "evaluate":
             print(variant_table(_evaluate(options)))
@@ -165,22 +167,19 @@ def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]
     return results
 
 
-def _steps(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number of 1 or more, got {text!r}")
-    return int(text)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="dyfn-train", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(
+        "dyfn-train", "Train the small model's base, or DyFN on top of it, and score the result."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     purposes = {
         "base": "train encoder and head on rendered frames",
         "stabilizer": "train DyFN on clips or recordings, everything else frozen",
         "scale": "teach DyFN's recurrence the base's errors of scale, without decoding",
     }
     for name, purpose in purposes.items():
-        command = commands.add_parser(name, help=purpose, description=purpose)
+        command = commands.add_parser(name, help=purpose, description=described(purpose))
         command.add_argument("config", type=Path, nargs="?", help="YAML file with the settings")
         command.add_argument(
             "--data",
@@ -192,34 +191,35 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.add_argument("--out", type=Path, required=True, help="folder of the run")
         command.add_argument("--resume", action="store_true", help="go on from OUT/state.pt")
-        command.add_argument("--max-steps", type=_steps, help="stop at this step")
+        command.add_argument("--max-steps", type=at_least_one, help="stop at this step")
         command.add_argument(
             "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
         )
     experiments.add_parser(commands)
-    command = commands.add_parser("curve", help="images seen against error of a run: CSV and PNG")
+    purpose = "images seen against error of a run: CSV and PNG"
+    command = commands.add_parser("curve", help=purpose, description=described(purpose))
     command.add_argument("run", type=Path, help="folder of a run, with its log.jsonl")
     command.add_argument("--metric", action="append", default=[], help="default: all logged")
     command.add_argument("--config", type=Path, help="of the run, if its folder has none")
     command.add_argument("--out", type=Path, help="folder for both files (default: the run's)")
-    command = commands.add_parser(
-        "average", help="mean of the weights of runs with a common start; DyFN is the first's"
-    )
+    purpose = "mean of the weights of runs with a common start; DyFN is the first's"
+    command = commands.add_parser("average", help=purpose, description=described(purpose))
     command.add_argument("models", type=Path, nargs="+", help="checkpoint files")
     command.add_argument(
         "--shares", type=float, nargs="+", help="of each, divided by their sum (default: equal)"
     )
     command.add_argument("--out", type=Path, required=True, help="file to write")
-    command = commands.add_parser(
-        "evaluate", help="a model and its controls under the image and video protocols"
-    )
+    purpose = "a model and its controls under the image and video protocols"
+    command = commands.add_parser("evaluate", help=purpose, description=described(purpose))
     command.add_argument("model", help="checkpoint or name")
     command.add_argument("--rendered", type=Path, help="root of rendered folders: held-out clips")
-    command.add_argument("--clips", type=int, default=12, help="at most so many of them")
+    command.add_argument(
+        "--clips", type=at_least_one, default=12, metavar="N", help="score N clips (default: 12)"
+    )
     command.add_argument(
         "--recording", type=Path, action="append", default=[], help="folder with rgb/ and depth/"
     )
-    command.add_argument("--stride", type=int, default=1, help="every so-many-th frame")
+    add_stride(command)
     return parser
 
 

@@ -5,9 +5,9 @@ from dyfn_core.models.checkpoints import (
     CheckpointError,
     load_model,
     model_fingerprint,
-    resolve_device,
     save_model,
 )
+from dyfn_core.models.device import resolve_device
 
 __all__ = [
     "AffinePoints",

@@ -28,6 +28,7 @@ from torch import Tensor
 from dyfn_core.files import finished_file
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.depth_anything import DepthAnythingModel, official_encoder
+from dyfn_core.models.device import resolve_device
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
@@ -74,25 +75,27 @@ class Checkpoint:
     official: bool = False
 
 
-def resolve_device(device: torch.device | str) -> torch.device:
-    """Where to run: "auto" is a GPU if there is one, else the CPU."""
-    if device == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(device)
-
-
 def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> GeometryModel:
     """A trained model, in eval mode, float32.
 
     Args:
         name_or_path: "dyfn-mini" (bundled), a file, or a Hub id such as "shawlyu/DyFN" or
             "Ruicheng/moge-vitl", optionally with "/file".
-        device: "cpu", "cuda", "cuda:N", or "auto": a GPU if there is one.
+        device: a torch device or its name; "auto" takes a GPU if there is one.
+
+    Returns:
+        The model. `model.stabilizer` is its DyFN module, None for a plain base model.
 
     Raises:
-        FileNotFoundError: No such file; or no network, then saying what to download and where to
+        FileNotFoundError: no such file; or no network, then saying what to download and where to
             put it.
-        CheckpointError: No checkpoint, or keys that do not fit, all listed.
+        CheckpointError: no checkpoint, or keys that do not fit, all listed.
+        ValueError: no such device.
+
+    Example:
+        >>> model = load_model("dyfn-mini")
+        >>> model.quantity, model.stabilizer is not None
+        ('depth', True)
     """
     name, device = os.fspath(name_or_path), resolve_device(device)
     if name in BUNDLED and not Path(name).exists():

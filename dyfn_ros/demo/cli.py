@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from dyfn_core.argument_types import not_negative
+from dyfn_core.cli.arguments import add_max_frames, add_model, command_parser, renamed
 from dyfn_core.evaluation.report.html import Section, Text, text_table, write_report
 from dyfn_core.evaluation.report.pictures import draw_cloud, encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
@@ -46,20 +48,46 @@ class DemoOptions:
     domain: int = 1
 
 
-def parse(arguments: Sequence[str] | None = None) -> DemoOptions:
-    """Command line -> Options."""
-    parser = argparse.ArgumentParser(
-        prog="dyfn-demo",
-        description="Play a recording through the live node over DDS on this machine, with and "
-        "without DyFN, and score what comes back.",
-        epilog="Exit code: 0 done, 1 the node failed, 2 the recording cannot be used.",
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(
+        "dyfn-demo",
+        "Play a recording through the live node over DDS on this machine, with and without DyFN, "
+        "and score what comes back.",
+        "Exit code: 0 done, 1 the node failed, 2 the recording cannot be used.",
     )
-    parser.add_argument("--recording", type=Path, default=default_recording())
-    parser.add_argument("--out", type=Path, default=Path("out/demo"))
-    parser.add_argument("--model", default="dyfn-mini")
-    parser.add_argument("--max-frames", type=int)
-    parser.add_argument("--domain", type=int, default=1 + os.getpid() % DOMAINS)
-    return DemoOptions(**vars(parser.parse_args(arguments)))
+    recording = parser.add_argument(
+        "recording",
+        nargs="?",
+        default=argparse.SUPPRESS,  # another default would overwrite what --recording says
+        help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder (default: bags/demo of the "
+        "source tree)",
+    )
+    renamed(parser, "--recording", recording, "RECORDING without an option's name")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        metavar="DIR",
+        help="folder for the results (default: out/demo)",
+    )
+    add_model(parser)
+    add_max_frames(parser)
+    parser.add_argument(
+        "--domain",
+        type=not_negative,
+        default=1 + os.getpid() % DOMAINS,
+        metavar="N",
+        help="DDS domain (ROS_DOMAIN_ID) of this run (default: one that follows from the process)",
+    )
+    return parser
+
+
+def parse(arguments: Sequence[str] | None = None) -> DemoOptions:
+    """Command line -> DemoOptions; ends the process with code 2 on a wrong one."""
+    given = vars(parser().parse_args(arguments))
+    recording = Path(given.pop("recording", default_recording()))
+    return DemoOptions(recording, **given)
 
 
 def default_recording() -> Path:

@@ -23,7 +23,7 @@ TINY_NODE = [sys.executable, "-m", "tests.support.tiny_node"]
 
 def play(recording: Path, out: Path, command: list[str], model: str = "tiny") -> int:
     with own_domain() as domain:
-        where = ["--recording", str(recording), "--out", str(out)]
+        where = [str(recording), "--out", str(out)]
         return main([*where, "--model", model, "--domain", domain["ROS_DOMAIN_ID"]], command)
 
 
@@ -85,7 +85,7 @@ def test_a_signal_ends_the_demo_and_its_node(tmp_path: Path, number: int) -> Non
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"sys.exit(main(sys.argv[1:], [sys.executable, {str(script)!r}]))"
     )
-    where = ["--recording", str(tmp_path / "walk"), "--out", str(tmp_path / "out")]
+    where = [str(tmp_path / "walk"), "--out", str(tmp_path / "out")]
     with own_domain() as domain:
         demo = subprocess.Popen(
             [sys.executable, "-c", code, *where, "--domain", domain["ROS_DOMAIN_ID"]],
