@@ -10,6 +10,8 @@ a uniform draw in 0.3..3 times the truth. No alignment is made: AbsRel is of met
     frame    the frame's own median scale, from all true pixels: no scale can do better
     ground   known camera height and up vector (rendered rooms, whose floor is at 0)
     fixed 1  metric_scale = 1, the unit that the model happens to have
+The frames run through a StreamSession with its defaults; docs/metric_scale.md has the results of
+--scene-cut-threshold 0.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -25,13 +27,17 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dyfn_core import DepthStream, load_model
+from dyfn_core import Frame, Prediction, load_model
 from dyfn_core.data.rendered import read_shard
 from dyfn_core.geometry.camera import pixel_intrinsics
 from dyfn_core.metric.calibration import CalibrationOptions
 from dyfn_core.metric.references import PointReference
 from dyfn_core.metric.scale import MetricScale, ScaleOptions
 from dyfn_core.models.base import GeometryModel
+from dyfn_core.stream.metric_stage import MetricStage
+from dyfn_core.stream.options import StreamOptions
+from dyfn_core.stream.session import StreamSession
+from dyfn_core.stream.stages import StreamStage
 from dyfn_ros.recordings.open import open_recording
 
 CLIP_RATE = 5.0  # frames a second of rendered walks
@@ -49,16 +55,6 @@ class TrueFrame:
     stamp: float
     up: np.ndarray | None = None
     height: float = 0.0
-
-
-@dataclass(frozen=True)
-class View:
-    """A predicted frame as arrays: see DepthView."""
-
-    points: np.ndarray
-    depth: np.ndarray
-    valid: np.ndarray
-    camera_matrix: np.ndarray
 
 
 @dataclass
@@ -92,7 +88,7 @@ def true_frames(folder: Path) -> Iterator[TrueFrame]:
 
 
 def sparse_points(
-    frame: TrueFrame, geometry: View, count: int, outliers: float, rng: np.random.Generator
+    frame: TrueFrame, matrix: np.ndarray, count: int, outliers: float, rng: np.random.Generator
 ) -> PointReference:
     """What a sparse sensor would measure: points in metres, some of them wrong."""
     rows, columns = np.nonzero(np.isfinite(frame.depth) & (frame.depth > 0.05))
@@ -101,87 +97,134 @@ def sparse_points(
     z = frame.depth[rows, columns] * (1 + NOISE * rng.standard_normal(len(rows)))
     wrong = rng.random(len(rows)) < outliers
     z[wrong] *= rng.uniform(0.3, 3, int(wrong.sum()))
-    k = geometry.camera_matrix
+    k = matrix
     x, y = (columns - k[0, 2]) / k[0, 0] * z, (rows - k[1, 2]) / k[1, 1] * z
     return PointReference(np.column_stack([x, y, z]))
 
 
-class Sources:
-    """The rows' scales over one sequence."""
+class Beside(StreamStage):
+    """A metric stage whose scale is read and whose metres are not used."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.rng = np.random.default_rng(options.seed)
-        self.scales = {
-            mode: MetricScale(ScaleOptions("reference", calibration=CalibrationOptions(mode)))
-            for mode in ("hold", "track")
-        }
-        self.ground = CalibrationOptions("track", min_points=3)
-        self.ground_scale: MetricScale | None = None
-        self.ground_found = self.frames = 0
+    def __init__(self, mode: str) -> None:
+        options = StreamOptions(metric_source="reference", calibration=mode)
+        self.metric = MetricStage(lambda: options)
         self.seconds = 0.0
+
+    def started(self, reason: str | None) -> None:
+        self.metric.started(reason)
+
+    def after_prediction(
+        self, frame: Frame, prediction: Prediction[np.ndarray]
+    ) -> Prediction[np.ndarray]:
+        begin = time.process_time()
+        self.metric.after_prediction(frame, prediction)
+        self.seconds += time.process_time() - begin
+        return prediction
+
+    @property
+    def scale(self) -> float | None:
+        """In force at the last frame."""
+        return self.metric.scale.map.scale if self.metric.scale.map else None
+
+
+class Sensor(StreamStage):
+    """Gives the stages that follow what a sparse sensor measures of the frame that is pushed."""
+
+    def __init__(self, rows: Sequence[Beside], options: argparse.Namespace) -> None:
+        self.rows, self.options = rows, options
+        self.rng = np.random.default_rng(options.seed)
+        self.truth: TrueFrame | None = None
+
+    def after_prediction(
+        self, frame: Frame, prediction: Prediction[np.ndarray]
+    ) -> Prediction[np.ndarray]:
+        assert self.truth is not None
+        count, outliers = self.options.points, self.options.outliers
+        points = sparse_points(self.truth, prediction.camera_matrix, count, outliers, self.rng)
+        for row in self.rows:
+            row.metric.add_reference(self.truth.stamp, points)
+        return prediction
+
+
+class Ground(StreamStage):
+    """The height of a hand-held camera changes: the source is told its height at each frame."""
+
+    def __init__(self) -> None:
+        self.calibration = CalibrationOptions("track", min_points=3)
+        self.metric: MetricScale | None = None
+        self.truth: TrueFrame | None = None
+        self.scale: float | None = None
+        self.found = 0
 
     @property
     def refused(self) -> Counter[str]:
-        return self.ground_scale.calibrator.dropped if self.ground_scale else Counter()
+        """Frames without a ground plane, by reason."""
+        return self.metric.calibrator.dropped if self.metric else Counter()
 
-    def maps(self, frame: TrueFrame, geometry: View) -> dict[str, float]:
-        """Scale of each row that has one now."""
-        points = sparse_points(
-            frame, geometry, self.options.points, self.options.outliers, self.rng
-        )
-        begin = time.process_time()
-        found: dict[str, float] = {"fixed 1": 1.0}
-        for mode, scale in self.scales.items():
-            metric_map = scale.push(geometry, frame.stamp, [points]).map
-            if metric_map is not None:
-                found[mode] = metric_map.scale
-        self.seconds += (time.process_time() - begin) / len(self.scales)
-        self.frames += 1
-        if frame.up is not None:
-            self._from_ground(frame, geometry, found)
-        return found
+    def started(self, reason: str | None) -> None:
+        if self.metric is not None:
+            self.metric.reset()
 
-    def _from_ground(self, frame: TrueFrame, geometry: View, found: dict[str, float]) -> None:
-        """The height of a hand-held camera changes: the source is told anew at each frame."""
-        assert frame.up is not None
-        up = (float(frame.up[0]), float(frame.up[1]), float(frame.up[2]))
-        options = ScaleOptions("camera_height", 1.0, frame.height, up, self.ground)
-        if self.ground_scale is None:
-            self.ground_scale = MetricScale(options)
-        self.ground_scale.options = options
+    def after_prediction(
+        self, frame: Frame, prediction: Prediction[np.ndarray]
+    ) -> Prediction[np.ndarray]:
+        truth = self.truth
+        if truth is None or truth.up is None:
+            return prediction
+        up = (float(truth.up[0]), float(truth.up[1]), float(truth.up[2]))
+        options = ScaleOptions("camera_height", 1.0, truth.height, up, self.calibration)
+        if self.metric is None:
+            self.metric = MetricScale(options)
+        self.metric.options = options
         before = self.refused.total()
-        metric_map = self.ground_scale.push(geometry, frame.stamp).map
-        self.ground_found += before == self.refused.total()
-        if metric_map is not None:
-            found["ground"] = metric_map.scale
+        found = self.metric.push(prediction, truth.stamp).map
+        self.found += before == self.refused.total()
+        self.scale = None if found is None else found.scale
+        return prediction
 
 
-def predicted_view(stream: DepthStream, frame: TrueFrame) -> View:
-    stream.camera_matrix = frame.matrix
-    prediction = stream.push(frame.image, frame.stamp)
-    depth, valid = prediction.depth.numpy(), prediction.mask.numpy()
-    matrix = frame.matrix
-    if matrix is None:
-        matrix = pixel_intrinsics(prediction.intrinsics.numpy(), depth.shape)
-    return View(prediction.points.numpy(), depth, valid & np.isfinite(depth) & (depth > 0), matrix)
+class Sources:
+    """A session over one sequence, and the rows' scales beside it."""
+
+    def __init__(self, model: GeometryModel, stabilize: bool, options: argparse.Namespace) -> None:
+        self.rows = {mode: Beside(mode) for mode in ("hold", "track")}
+        self.sensor, self.ground = Sensor(list(self.rows.values()), options), Ground()
+        self.session = StreamSession(
+            model,
+            StreamOptions(stabilize=stabilize, scene_cut_threshold=options.scene_cut_threshold),
+            stages=[self.sensor, *self.rows.values(), self.ground],
+        )
+        self.frames = 0
+
+    @property
+    def seconds(self) -> float:
+        """CPU time of one row's scale, all frames together."""
+        return sum(row.seconds for row in self.rows.values()) / len(self.rows)
+
+    def push(self, truth: TrueFrame) -> tuple[Prediction[np.ndarray], dict[str, float]]:
+        """-> the frame's geometry, up to scale, and the scale of each row that has one now."""
+        self.sensor.truth = self.ground.truth = truth
+        prediction = self.session.push(Frame(truth.image, truth.stamp, truth.matrix))
+        self.frames += 1
+        found = {name: row.scale for name, row in self.rows.items()}
+        scales = {"fixed 1": 1.0, "ground": self.ground.scale, **found}
+        return prediction, {row: scale for row, scale in scales.items() if scale is not None}
 
 
 def run(
     model: GeometryModel, folder: Path, stabilize: bool, options: argparse.Namespace
 ) -> tuple[np.ndarray, dict[str, Track], Sources]:
     """-> stamps (T), errors by row (NaN where a row has no scale yet), and the sources."""
-
-    stream, sources = DepthStream(model, stabilize=stabilize), Sources(options)
+    sources = Sources(model, stabilize, options)
     tracks, stamps = {row: Track() for row in ROWS}, []
     for frame in true_frames(folder):
-        geometry = predicted_view(stream, frame)
-        usable = geometry.valid & np.isfinite(frame.depth)
-        predicted, truth = geometry.depth[usable], frame.depth[usable]
+        prediction, scales = sources.push(frame)
+        usable = prediction.valid & np.isfinite(frame.depth)
+        predicted, truth = prediction.depth[usable], frame.depth[usable]
         if not len(truth):
             continue
         own = float(np.median(truth / predicted))
-        scales = {**sources.maps(frame, geometry), "frame": own}
+        scales["frame"] = own
         stamps.append(frame.stamp)
         for row, track in tracks.items():
             scale = scales.get(row, np.nan)
@@ -277,6 +320,9 @@ def main() -> None:
     parser.add_argument("--model", default="dyfn-mini")
     parser.add_argument("--points", type=int, default=15, help="of the sparse reference, a frame")
     parser.add_argument("--outliers", type=float, default=0.2, help="share of wrong points")
+    parser.add_argument(
+        "--scene-cut-threshold", type=float, default=StreamOptions.scene_cut_threshold
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/metric"))
     options = parser.parse_args()
@@ -294,13 +340,13 @@ def main() -> None:
     every = [sources for runs in results.values() for _, _, sources in runs]
     pushed = sum(sources.frames for sources in every)
     print(f"\n{1000 * sum(s.seconds for s in every) / pushed:.2f} ms a frame for the scale")
-    with_ground = [s for s in every if s.ground_scale is not None]
+    with_ground = [s for s in every if s.ground.metric is not None]
     if with_ground:
-        share = sum(s.ground_found for s in with_ground) / sum(s.frames for s in with_ground)
+        share = sum(s.ground.found for s in with_ground) / sum(s.frames for s in with_ground)
         print(f"ground plane found in {share:.0%} of the frames of rooms")
         refused: Counter[str] = Counter()
         for sources in with_ground:
-            refused.update(sources.refused)
+            refused.update(sources.ground.refused)
         print(f"refused: {dict(refused.most_common())}")
 
 
