@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-Kinds = Mapping[str, type]  # the dataclasses that may occur, by name
+Kinds = Mapping[str, type]  # the dataclasses that may occur, by their name in a file
 
 
 class PlainError(ValueError):
@@ -41,9 +41,10 @@ def to_plain(value: Any, tensors: dict[str, Tensor], kinds: Kinds) -> Any:
     if isinstance(value, dict):
         kind = "counter" if isinstance(value, Counter) else "dict"
         return {kind: {str(key): to_plain(one, tensors, kinds) for key, one in value.items()}}
-    if is_dataclass(value) and type(value).__name__ in kinds:
+    described = next((name for name, known in kinds.items() if known is type(value)), None)
+    if is_dataclass(value) and described is not None:
         content = {f.name: to_plain(getattr(value, f.name), tensors, kinds) for f in fields(value)}
-        return {"type": type(value).__name__, "fields": content}
+        return {"type": described, "fields": content}
     raise TypeError(f"a {type(value).__name__} is not of a known type")
 
 

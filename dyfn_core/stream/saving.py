@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dyfn_core.files import OutputError
 from dyfn_core.models.checkpoints import model_fingerprint
 from dyfn_core.stream.depth_stream import DepthStream, StreamMemory, same_camera
 from dyfn_core.stream.options import StreamOptions
@@ -106,9 +107,8 @@ class StateKeeper:
         notes = {"frame_id": now.settings.frame_id}
         try:
             save_stream(_checked(path), stream, self.fingerprint, notes=notes, **now.stages)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise StateError(f"cannot write {path}: {reason}; an older file is kept") from error
+        except OutputError as error:
+            raise StateError(f"{error}; an older file is kept") from error
         return f"saved {now.memory.frames} frames' memory to {path}"
 
     def load(self, path: str, options: StreamOptions) -> Loaded:

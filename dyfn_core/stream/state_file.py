@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
+from dyfn_core.files import finished_file
 from dyfn_core.metric.calibration import ScaleCalibration
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.references import Evidence
@@ -49,19 +48,17 @@ class SavedStream:
     notes: dict[str, str] = field(default_factory=dict)
 
 
+# The names are a part of the format: a class that is renamed keeps the name that files have.
 _KINDS: dict[str, type] = {
-    kind.__name__: kind
-    for kind in (
-        SavedStream,
-        StreamMemory,
-        StreamState,
-        MeanState,
-        ScaleCalibration,
-        MetricMap,
-        Evidence,
-        CutState,
-        PictureFeatures,
-    )
+    "SavedStream": SavedStream,
+    "StreamMemory": StreamMemory,
+    "StreamState": StreamState,
+    "Track": MeanState,
+    "Calibration": ScaleCalibration,
+    "MetricMap": MetricMap,
+    "Evidence": Evidence,
+    "CutState": CutState,
+    "Look": PictureFeatures,
 }
 
 
@@ -86,10 +83,10 @@ def save_stream(
     cut: CutState | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write a stream's state, whole or not at all: a file of that name stays until it is.
+    """Write a stream's state, whole or not at all: an older file stays until then.
 
     fingerprint: of the stream's model, see dyfn_core.models.checkpoints.model_fingerprint.
-    Raises OSError (no such folder, disk full); the old file is then as it was.
+    Raises OutputError (no such folder, disk full); the old file is then as it was.
     """
     saved = SavedStream(
         stream.memory,
@@ -104,22 +101,8 @@ def save_stream(
         {"model": fingerprint, "state": to_plain(saved, tensors, _KINDS)}, sort_keys=True
     )
     metadata = {"format": FORMAT, "content": content, "digest": _digest(content, tensors)}
-    write_whole(Path(path), save_tensors(tensors, metadata))
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Replace a file in one step: readers see the old content or the new. Raises OSError."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with finished_file(Path(path), durable=True) as partial:
+        partial.write_bytes(save_tensors(tensors, metadata))
 
 
 def load_stream(path: str | Path, fingerprint: str) -> SavedStream:
