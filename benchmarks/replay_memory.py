@@ -32,7 +32,7 @@ EXTRAS = {"video": "av", "rrd": "rerun"}  # output -> module of its extra
 # The most that was ever resident, of this process alone: rusage would count its parent's too.
 CHILD = """
 import sys
-from dyfn_ros.replay.run import main
+from dyfn_ros.replay.cli import main
 code = main(sys.argv[1:])
 status = open("/proc/self/status").read()
 print("peak_kb", next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])

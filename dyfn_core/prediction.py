@@ -13,8 +13,8 @@ from torch import Tensor
 from typing_extensions import TypeVar
 
 from dyfn_core.geometry.camera import pixel_intrinsics
-
-DEPTH, DISPARITY = "depth", "disparity"
+from dyfn_core.quantities import DEPTH as DEPTH
+from dyfn_core.quantities import DISPARITY as DISPARITY
 
 
 @dataclass(frozen=True)

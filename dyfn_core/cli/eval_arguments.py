@@ -19,8 +19,8 @@ from dyfn_core.cli.arguments import (
     add_stride,
     renamed,
 )
-from dyfn_core.evaluation.benchmarks.predictions import QUANTITIES
 from dyfn_core.evaluation.benchmarks.registry import AUTO, LAYOUTS
+from dyfn_core.quantities import QUANTITIES
 from dyfn_core.scoring.protocols import FITS, L1
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.benchmarks.predictions import scored_values
 from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.projection import back_project, render_depth, resized_camera
 from dyfn_core.prediction import DEPTH, DISPARITY
+from dyfn_core.quantities import scored_values
 from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 from dyfn_ros.messages.encodings import MessageError
@@ -28,7 +28,7 @@ class GroundTruth:
 
     transform: pose of its sensor in the image's optical frame; None: the image's own place.
     warn: takes what had to be assumed. quantity: what its images hold, one of
-    predictions.QUANTITIES; inverse depth is inverted, disparity stays what it is.
+    quantities.QUANTITIES; inverse depth is inverted, disparity stays what it is.
 
     A depth image without CameraInfo, or with the intrinsics and lens of the image, is registered
     already: it shows the image's view, at any resolution. Any other is projected into the image.

@@ -9,37 +9,36 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tqdm import tqdm
 
 from dyfn_core.files import finished_file
+from dyfn_core.models.checkpoints import model_fingerprint
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
+from dyfn_ros.replay.batch_ray import ray_runner
 from dyfn_ros.replay.batch_summary import Row, write_summary
-from dyfn_ros.replay.jobs import CRASHED, Outcome, ReplayJob, Runner, run_one
-from dyfn_ros.replay.options import ReplayOptions, split
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, ModelLoader, load
-
-if TYPE_CHECKING:
-    from dyfn_core.models.base import GeometryModel
+from dyfn_ros.replay.jobs import (
+    ALL,
+    CRASHED,
+    PARTIAL,
+    UNUSABLE,
+    BatchJob,
+    Outcome,
+    Runner,
+    outcome_of,
+    split,
+)
+from dyfn_ros.replay.run import ModelLoader, load
+from dyfn_ros.replay.settings import BatchOptions, PredictionTopic, ReplayJob, TopicChoice
 
 USABLE = (ALL, PARTIAL)
 RECORDING_FILE = re.compile(r"(?P<name>.+)\.(mcap|db3|bag)(\.zstd)?")
 PART = re.compile(r"(?P<name>.*)_\d+")
-# Where the results go and what is shown meanwhile: the results are the same.
-FREE_OPTIONS = ("recording", "out", "progress")
-
-
-@dataclass(frozen=True)
-class BatchOptions:
-    """jobs: worker processes here. ray: a cluster's address, "local" for one made here, or None."""
-
-    jobs: int = 1
-    ray: str | None = None
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
@@ -60,7 +59,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_many(paths: Sequence[Path]) -> bool:
-    """Whether the paths are a fleet, be it of one, or one recording."""
+    """Whether the paths are a batch, be it of one recording, and not a single recording."""
     return len(paths) > 1 or paths[0].suffix == ".txt" or _inside(paths[0]) != [paths[0]]
 
 
@@ -95,128 +94,163 @@ def _is_recording(folder: Path) -> bool:
     return len(parts) == 1 and not any(f.is_dir() and _is_recording(f) for f in folder.iterdir())
 
 
-def plan(recordings: Sequence[Path], options: ReplayOptions, checksum: str) -> list[ReplayJob]:
-    """A job per recording and image topic, each with a folder of its own under options.out."""
-    jobs: list[ReplayJob] = []
+def plan(
+    recordings: Sequence[Path],
+    job: ReplayJob,
+    topics: TopicChoice,
+    fingerprint: str,
+) -> list[BatchJob]:
+    """A job per recording and image topic, each with a folder of its own.
+
+    Args:
+        recordings: As `expand` returns them.
+        job: What they share; its outputs' folder takes the folders.
+        topics: Image topics of each recording.
+        fingerprint: Of the model, a part of each job's key.
+
+    Returns:
+        The jobs, in the recordings' order.
+    """
+    jobs: list[BatchJob] = []
     taken: set[str] = set()
+    top = job.outputs.folder.absolute()
     for recording in recordings:
         path = recording.absolute()  # a link keeps its own name
-        match = RECORDING_FILE.fullmatch(path.name)
-        name = path.name if match is None or path.is_dir() else match["name"]
-        name = name if name not in taken else f"{path.parent.name}_{name}"
-        number, free = 2, name
-        while free in taken:
-            number, free = number + 1, f"{name}-{number}"
-        taken.add(free)
-        own = replace(options, recording=path, out=options.out.absolute() / free, progress=False)
-        for one in _topics(own):
-            part = one.out.relative_to(own.out)
-            jobs.append(ReplayJob(str(Path(free) / part), one, _key(one, checksum)))
+        name = _free_name(path, taken)
+        taken.add(name)
+        own = replace(
+            job,
+            source=replace(job.source, recording=path),
+            outputs=replace(job.outputs, folder=top / name, progress=False),
+        )
+        for one in _split(own, topics):
+            jobs.append(
+                BatchJob(str(one.outputs.folder.relative_to(top)), one, _key(one, fingerprint))
+            )
     return jobs
 
 
-def _topics(options: ReplayOptions) -> list[ReplayOptions]:
+def _free_name(path: Path, taken: set[str]) -> str:
+    """A recording's own name, made longer while it is taken."""
+    match = RECORDING_FILE.fullmatch(path.name)
+    name = path.name if match is None or path.is_dir() else match["name"]
+    name = name if name not in taken else f"{path.parent.name}_{name}"
+    number, free = 2, name
+    while free in taken:
+        number, free = number + 1, f"{name}-{number}"
+    return free
+
+
+def _split(job: ReplayJob, topics: TopicChoice) -> list[ReplayJob]:
     try:
-        return split(options)
-    except RecordingError:  # the replay of it says why, and the others go on
-        return [options]
+        return split(job, topics)
+    except RecordingError:  # its replay says why, and the others go on
+        return [job]
 
 
-def _key(options: ReplayOptions, checksum: str) -> str:
-    """Of the options, the model's weights, and the recording's files, sizes and times."""
-    path = options.recording
+def _key(job: ReplayJob, fingerprint: str) -> str:
+    """Hash of the options, the model, and the names, sizes and times of the recording's files."""
+    path = job.source.recording
     files = sorted(f for f in path.rglob("*") if f.is_file()) if path.is_dir() else [path]
     state = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files if f.exists()]
-    chosen = {name: v for name, v in asdict(options).items() if name not in FREE_OPTIONS}
-    text = json.dumps([chosen, checksum, state], default=str, sort_keys=True)
+    # Where results go and what is shown meanwhile does not change them.
+    parts = asdict(replace(job, outputs=replace(job.outputs, folder=Path(), progress=False)))
+    text = json.dumps([parts, type(job.run).__name__, fingerprint, state], default=str)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def model_checksum(model: GeometryModel) -> str:
-    """SHA-256 over names and bytes of all weights."""
-    found = hashlib.sha256()
-    for name, tensor in sorted(model.state_dict().items()):
-        found.update(name.encode())
-        found.update(tensor.detach().cpu().contiguous().flatten().numpy().tobytes())
-    return found.hexdigest()
 
 
 def replay_all(
     recordings: Sequence[Path],
-    options: ReplayOptions,
-    fleet: BatchOptions,
+    job: ReplayJob,
+    topics: TopicChoice,
+    batch: BatchOptions,
     loader: ModelLoader = load,
 ) -> int:
-    """Replay every recording into its own folder and write the summary over all; -> exit code.
+    """Replay every recording into its own folder and write the summary over all.
 
     Recordings that are finished with the same options, weights and files are not run again. One
-    that fails is reported and the others go on. ALL when all are whole, PARTIAL when some are
-    partial or failed, UNUSABLE when none gave results. Raises what loader raises, OutputError.
+    that fails is reported and the others go on.
+
+    Args:
+        recordings: As `expand` returns them.
+        job: What they share; its outputs' folder takes their folders and the summary.
+        topics: Image topics of each recording.
+        batch: Where the jobs run.
+        loader: Gives the models.
+
+    Returns:
+        ALL when all are whole, PARTIAL when some are partial or failed, UNUSABLE when none gave
+        results.
+
+    Raises:
+        OutputError: The summary or an outcome cannot be written; or whatever `loader` raises.
     """
-    checksum = model_checksum(loader(options.model, "cpu"))
-    jobs = plan(recordings, options, checksum)
-    outcomes = {job.name: done for job in jobs if (done := _finished(job)) is not None}
-    waiting = [job for job in jobs if job.name not in outcomes]
+    fingerprint = ""
+    if not isinstance(job.run, PredictionTopic):
+        fingerprint = model_fingerprint(loader(job.run.model, "cpu"))
+    jobs = plan(recordings, job, topics, fingerprint)
+    outcomes = {one.name: done for one in jobs if (done := _finished(one)) is not None}
+    waiting = [one for one in jobs if one.name not in outcomes]
     if outcomes:
         print(f"{len(outcomes)} of {len(jobs)} were finished before and are kept", file=sys.stderr)
-    for job, outcome in tqdm(
-        _runner(fleet)(waiting, loader), total=len(waiting), unit="recording", file=sys.stderr
+    for one, outcome in tqdm(
+        _runner(batch)(waiting, loader), total=len(waiting), unit="recording", file=sys.stderr
     ):
-        outcomes[job.name] = outcome
-        _remember(job, outcome)
+        outcomes[one.name] = outcome
+        _remember(one, outcome)
         if outcome.code != ALL:
             kind = "partial" if outcome.code == PARTIAL else f"failed (code {outcome.code})"
-            print(
-                f"dyfn-replay: {job.options.recording}: {kind}: {outcome.reason}", file=sys.stderr
-            )
-    rows = [_row(job, outcomes[job.name]) for job in jobs]
-    print(write_summary(options.out, rows))
+            path = one.job.source.recording
+            print(f"dyfn-replay: {path}: {kind}: {outcome.reason}", file=sys.stderr)
+    rows = [_row(one, outcomes[one.name]) for one in jobs]
+    print(write_summary(job.outputs.folder, rows))
     codes = {row.code for row in rows}
     if not codes & set(USABLE):
         return UNUSABLE
     return ALL if codes == {ALL} else PARTIAL
 
 
-def _runner(fleet: BatchOptions) -> Runner:
-    if fleet.ray is not None:
-        from dyfn_ros.replay.batch_ray import ray_runner
-
-        return ray_runner(fleet.ray, fleet.jobs)
-    return lambda jobs, loader: run_locally(jobs, loader, fleet.jobs)
+def _runner(batch: BatchOptions) -> Runner:
+    if batch.ray is not None:
+        return ray_runner(batch.ray, batch.jobs)
+    return lambda jobs, loader: run_locally(jobs, loader, batch.jobs)
 
 
-def _finished(job: ReplayJob) -> Outcome | None:
+def _finished(job: BatchJob) -> Outcome | None:
     """What is remembered of an earlier run that gave results of the same key."""
+    folder = job.job.outputs.folder
     try:
-        known = json.loads((job.options.out / "outcome.json").read_text(encoding="utf-8"))
+        known = json.loads((folder / "outcome.json").read_text(encoding="utf-8"))
         same = known["key"] == job.key and known["code"] in USABLE
-        done = same and (job.options.out / "metrics.json").exists()
+        done = same and (folder / "metrics.json").exists()
         return Outcome(known["code"], known["reason"]) if done else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
 
 
-def _remember(job: ReplayJob, outcome: Outcome) -> None:
-    job.options.out.mkdir(parents=True, exist_ok=True)
-    known = {"key": job.key, "recording": str(job.options.recording), **asdict(outcome)}
-    with finished_file(job.options.out / "outcome.json") as partial:
+def _remember(job: BatchJob, outcome: Outcome) -> None:
+    folder = job.job.outputs.folder
+    folder.mkdir(parents=True, exist_ok=True)
+    known = {"key": job.key, "recording": str(job.job.source.recording), **asdict(outcome)}
+    with finished_file(folder / "outcome.json") as partial:
         partial.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
 
 
-def _row(job: ReplayJob, outcome: Outcome) -> Row:
+def _row(job: BatchJob, outcome: Outcome) -> Row:
     metrics: dict[str, Any] = {}
     if outcome.code in USABLE:
-        metrics = json.loads((job.options.out / "metrics.json").read_text(encoding="utf-8"))
-    return Row(job.name, str(job.options.recording), outcome.code, outcome.reason, metrics)
+        text = (job.job.outputs.folder / "metrics.json").read_text(encoding="utf-8")
+        metrics = json.loads(text)
+    return Row(job.name, str(job.job.source.recording), outcome.code, outcome.reason, metrics)
 
 
 def run_locally(
-    jobs: Sequence[ReplayJob], loader: ModelLoader, workers: int
-) -> Iterator[tuple[ReplayJob, Outcome]]:
+    jobs: Sequence[BatchJob], loader: ModelLoader, workers: int
+) -> Iterator[tuple[BatchJob, Outcome]]:
     """A fresh process for each, `workers` at a time: one that dies takes no other along."""
     alive: set[Any] = set()
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        futures = {pool.submit(_in_process, job.options, loader, alive): job for job in jobs}
+        futures = {pool.submit(_in_process, one.job, loader, alive): one for one in jobs}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
@@ -227,10 +261,10 @@ def run_locally(
                 process.terminate()
 
 
-def _in_process(options: ReplayOptions, loader: ModelLoader, alive: set[Any]) -> Outcome:
+def _in_process(job: ReplayJob, loader: ModelLoader, alive: set[Any]) -> Outcome:
     context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(sender, options, loader), daemon=True)
+    process = context.Process(target=_work, args=(sender, job, loader), daemon=True)
     process.start()
     alive.add(process)
     sender.close()  # so that the worker's end is the only one, and its death is an end of file
@@ -245,5 +279,5 @@ def _in_process(options: ReplayOptions, loader: ModelLoader, alive: set[Any]) ->
     return outcome
 
 
-def _work(sender: Connection, options: ReplayOptions, loader: ModelLoader) -> None:
-    sender.send(run_one(options, loader))
+def _work(sender: Connection, job: ReplayJob, loader: ModelLoader) -> None:
+    sender.send(outcome_of(job, loader))

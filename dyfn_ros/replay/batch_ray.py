@@ -6,8 +6,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from dyfn_core.files import OutputError
-from dyfn_ros.replay.jobs import CRASHED, Outcome, ReplayJob, Runner, run_one
+from dyfn_ros.replay.jobs import CRASHED, BatchJob, Outcome, Runner, outcome_of
 from dyfn_ros.replay.run import ModelLoader
+from dyfn_ros.replay.settings import PredictionTopic, ReplayJob
 
 LOCAL = "local"  # Ray's own word for a cluster of this machine, made for this run
 
@@ -26,12 +27,10 @@ def ray_runner(address: str, jobs: int = 1) -> Runner:
             f"--ray needs Ray ({error}): install this package with its `ray` extra"
         ) from error
 
-    def run(
-        waiting: Sequence[ReplayJob], loader: ModelLoader
-    ) -> Iterator[tuple[ReplayJob, Outcome]]:
+    def run(waiting: Sequence[BatchJob], loader: ModelLoader) -> Iterator[tuple[BatchJob, Outcome]]:
         if not waiting:
             return
-        cpus = jobs * max(job.options.threads or 1 for job in waiting)
+        cpus = jobs * max(_needs(one.job)["num_cpus"] or 1 for one in waiting)
         ours: dict[str, Any] = {
             "num_cpus": cpus,
             "include_dashboard": False,
@@ -47,13 +46,12 @@ def ray_runner(address: str, jobs: int = 1) -> Runner:
 
 
 def _outcomes(
-    ray: Any, jobs: Sequence[ReplayJob], loader: ModelLoader
-) -> Iterator[tuple[ReplayJob, Outcome]]:
+    ray: Any, jobs: Sequence[BatchJob], loader: ModelLoader
+) -> Iterator[tuple[BatchJob, Outcome]]:
     tasks = {}
     for job in jobs:
-        needs = {"num_cpus": job.options.threads, "num_gpus": int("cuda" in job.options.device)}
-        remote = ray.remote(max_retries=1, **needs)(run_one)
-        tasks[remote.remote(job.options, loader)] = job
+        remote = ray.remote(max_retries=1, **_needs(job.job))(outcome_of)
+        tasks[remote.remote(job.job, loader)] = job
     while tasks:
         done, _ = ray.wait(list(tasks))
         for task in done:
@@ -63,3 +61,9 @@ def _outcomes(
                 first = str(error).strip().splitlines()[0]
                 outcome = Outcome(CRASHED, f"{type(error).__name__}: {first}")
             yield tasks.pop(task), outcome
+
+
+def _needs(job: ReplayJob) -> dict[str, int]:
+    if isinstance(job.run, PredictionTopic):
+        return {"num_cpus": 1, "num_gpus": 0}
+    return {"num_cpus": job.run.threads, "num_gpus": int("cuda" in job.run.device)}

@@ -56,7 +56,7 @@ def world_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points N x 3 (metres, world) and colours N x 3 uint8 of the solid pixels within depth_max."""
     assert frame.pose is not None
-    depth = alignment.depth(frame.said)
+    depth = alignment.depth(frame.predicted)
     kept = frame.solid & np.isfinite(depth) & (depth > 0) & (depth <= depth_max)
     v, u = np.nonzero(kept)
     z = depth[kept]

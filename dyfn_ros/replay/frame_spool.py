@@ -25,15 +25,15 @@ EDGE = 0.05  # relative depth step between neighbours that makes both flying pix
 class SmallFrame:
     """Every s-th pixel of a frame.
 
-    image: h x w x 3 uint8 RGB (averaged, not picked). said: h x w float32, depth or disparity as
-    the model said it, NaN where invalid. solid: h x w bool, valid and on no depth edge.
+    image: h x w x 3 uint8 RGB (averaged, not picked). predicted: h x w float32, depth or disparity,
+    NaN where invalid. solid: h x w bool, valid and on no depth edge.
     truth: h x w float32 metres, NaN invalid; None without. matrix: 3 x 3 pixels of this grid.
     pose: 4 x 4 camera to world, metres; None when unknown.
     """
 
     stamp_ns: int
     image: np.ndarray
-    said: np.ndarray
+    predicted: np.ndarray
     solid: np.ndarray
     truth: np.ndarray | None
     matrix: np.ndarray
@@ -67,7 +67,7 @@ class FrameSpool:
         arrays = (
             np.array(small.stamp_ns),
             small.image,
-            small.said,
+            small.predicted,
             small.solid,
             missing if small.truth is None else small.truth,
             small.matrix,
@@ -85,12 +85,14 @@ class FrameSpool:
         place = 0
         for _ in range(self.frames):
             self._file.seek(place)
-            stamp, image, said, solid, truth, matrix, pose = (np.load(self._file) for _ in range(7))
+            stamp, image, predicted, solid, truth, matrix, pose = (
+                np.load(self._file) for _ in range(7)
+            )
             place = self._file.tell()
             yield SmallFrame(
                 int(stamp),
                 image,
-                said,
+                predicted,
                 solid,
                 truth if truth.size else None,
                 matrix,
@@ -105,12 +107,12 @@ def shrink(
     shape = prediction.depth.shape
     step = math.ceil(max(shape) / MAX_SIDE)
     grid = (slice(step // 2, None, step),) * 2
-    said, valid = prediction.aligned_quantity
+    predicted, valid = prediction.aligned_quantity
     solid = prediction.valid & ~flying_pixels(prediction.depth, prediction.valid, EDGE)
     matrix = prediction.camera_matrix.astype(np.float64).copy()
     matrix[:2, 2] -= step // 2
     matrix[:2] /= step
-    small = np.where(valid, said, np.nan).astype(np.float32)[grid]
+    small = np.where(valid, predicted, np.nan).astype(np.float32)[grid]
     truth = None if frame.depth is None else to_shape(frame.depth, shape)[grid].astype(np.float32)
     image = cv2.resize(frame.image, small.shape[::-1], interpolation=cv2.INTER_AREA)
     return SmallFrame(frame.stamp_ns, image, small, solid[grid], truth, matrix, pose)

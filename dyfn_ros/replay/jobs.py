@@ -1,38 +1,47 @@
-"""One replay as a job: what is to be run, and how it ended."""
+"""A replay as a job: which there are, how one is run, and how it ended."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import Any
 
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.replay.options import ReplayOptions
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, ModelLoader, replay
+from dyfn_ros.recordings.open import image_topics
+from dyfn_ros.replay.run import ModelLoader, replay
+from dyfn_ros.replay.score_topic import score_topic
+from dyfn_ros.replay.settings import PredictionTopic, ReplayJob, TopicChoice
 
-if TYPE_CHECKING:
-    pass
-
-
-CRASHED = 1  # the code of a recording whose worker died, or failed in a way that is our fault
+ALL, CRASHED, UNUSABLE, PARTIAL = 0, 1, 2, 3  # exit codes; argparse also ends with 2
+EXPECTED_ERRORS = (RecordingError, ValueError, OSError)  # of input, options and disk
 
 
 @dataclass(frozen=True)
-class ReplayJob:
-    """One image topic of a recording to replay.
+class BatchJob:
+    """One job of several.
 
-    name: of its folder and row. key: of all that decides the result.
+    Attributes:
+        name: Of its folder and of its row in the summary.
+        job: What is replayed.
+        key: Hash of all that decides the result.
     """
 
     name: str
-    options: ReplayOptions
+    job: ReplayJob
     key: str
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a replay ended: the exit code that dyfn-replay gives for it alone, or CRASHED."""
+    """How a job ended.
+
+    Attributes:
+        code: The exit code that dyfn-replay gives for it alone; CRASHED when its worker died, or
+            it failed in a way that is our fault.
+        reason: What is not whole; "" for nothing.
+        traceback: Of an exception that is our fault.
+    """
 
     code: int
     reason: str = ""
@@ -40,16 +49,53 @@ class Outcome:
 
 
 # Runs jobs and gives each with its outcome, in any order.
-Runner = Callable[[Sequence[ReplayJob], ModelLoader], Iterator[tuple[ReplayJob, Outcome]]]
+Runner = Callable[[Sequence[BatchJob], ModelLoader], Iterator[tuple[BatchJob, Outcome]]]
 
 
-def run_one(options: ReplayOptions, loader: ModelLoader) -> Outcome:
-    """Replay one recording; every exception becomes an outcome."""
+def run_job(job: ReplayJob, loader: ModelLoader) -> dict[str, Any]:
+    """Run a job; see run.replay and score_topic.score_topic for result and exceptions."""
+    if isinstance(job.run, PredictionTopic):
+        return score_topic(job.source, job.run, job.outputs)
+    return replay(job.source, job.run, job.outputs, loader)
+
+
+def outcome_of(job: ReplayJob, loader: ModelLoader) -> Outcome:
+    """Run a job; every exception becomes an outcome."""
     try:
-        metrics = replay(options, loader)
-    except (RecordingError, ValueError, OSError) as error:
+        metrics = run_job(job, loader)
+    except EXPECTED_ERRORS as error:
         return Outcome(UNUSABLE, str(error))
     except Exception as error:
         return Outcome(CRASHED, f"{type(error).__name__}: {error}", traceback.format_exc())
     losses = metrics["recording"]["losses"]
     return Outcome(PARTIAL if losses else ALL, "; ".join(losses))
+
+
+def split(job: ReplayJob, topics: TopicChoice) -> list[ReplayJob]:
+    """One job per image topic, each with a folder of its own.
+
+    Args:
+        job: What the jobs share.
+        topics: Which topics.
+
+    Returns:
+        The jobs, in the topics' order; without a choice the job itself.
+
+    Raises:
+        RecordingError: The recording cannot be opened, or has no image topic.
+    """
+    names: Sequence[str] = topics.names
+    if topics.every:
+        names = [topic for topic in image_topics(job.source.recording) if topic]
+    if not names:
+        return [job]
+    return [
+        replace(
+            job,
+            source=replace(job.source, image_topic=name),
+            outputs=replace(
+                job.outputs, folder=job.outputs.folder / name.strip("/").replace("/", "_")
+            ),
+        )
+        for name in names
+    ]

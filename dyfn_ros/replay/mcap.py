@@ -1,4 +1,4 @@
-"""What a replay leaves as a recording for Foxglove: input, depth, camera info, cloud, scale."""
+"""output.mcap, a recording for Foxglove: input, depth, camera info, cloud, scale."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def subsampled(
 
 
 def score_values(prediction: Prediction[np.ndarray], score: FrameScore) -> dict[str, float]:
-    """What is plotted over time: the frame's median depth, and with truth its own alignment.
+    """Numbers to plot over time: the frame's median depth, and with truth its own alignment.
 
     median_depth: in the unit of the depth. scale, shift: what aligns this frame alone to the
     truth (image protocol; shift in metres). abs_rel: after that.

@@ -1,102 +1,114 @@
-"""What `dyfn-replay` can be told."""
+"""The command line of `dyfn-replay`."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from dyfn_core.argument_types import above_zero, at_least_one, not_negative
-from dyfn_core.evaluation.benchmarks.predictions import QUANTITIES
-from dyfn_core.prediction import DEPTH
+from dyfn_core.quantities import DEPTH, QUANTITIES
 from dyfn_core.threads import THREADS
-from dyfn_ros.recordings.open import image_topics
-from dyfn_ros.replay.outputs import DEFAULT, FILES, VOXEL, parse_outputs
+from dyfn_ros.replay.settings import (
+    DEFAULT,
+    FILES,
+    VOXEL,
+    BatchOptions,
+    Outputs,
+    PredictionTopic,
+    ReplayJob,
+    Run,
+    Source,
+    TopicChoice,
+    parse_outputs,
+)
+
+EPILOG = (
+    "Exit code: 0 everything was read, 3 part of the recording was damaged and the rest was used, "
+    "2 nothing usable (the reason is on stderr). Of several recordings or topics: 0 all are whole, "
+    "3 some are partial or failed, 2 none gave results."
+)
 
 
-@dataclass(frozen=True)
-class ReplayOptions:
-    """What to replay and how; see the command's --help."""
-
-    recording: Path
-    out: Path
-    model: str = "dyfn-mini"
-    image_topic: str | None = None
-    image_topics: tuple[str, ...] = ()  # several: one replay each, see split
-    all_topics: bool = False
-    camera_info_topic: str | None = None
-    depth_topic: str | None = None
-    prediction_topic: str | None = None
-    quantity: str = DEPTH  # of the prediction topic
-    depth_info_topic: str | None = None
-    depth_transform: str | None = None
-    stamps: Literal["header", "log"] = "header"
-    stabilizer: bool = True
-    compare: bool = False
-    controls: bool = False
-    max_frames: int | None = None
-    stride: int = 1
-    num_tokens: int | None = None
-    device: str = "cpu"
-    threads: int = THREADS
-    depth_max: float = math.inf
-    tolerance: float = 0.02
-    scene_cut_threshold: float = 0.0
-    write: tuple[str, ...] = DEFAULT
-    pose_topic: str | None = None
-    voxel: float = VOXEL
-    progress: bool = True
+_NEGATED = {"stabilizer": "--no-stabilizer"}  # field -> the option that turns it off
 
 
 @dataclass(frozen=True)
 class Command:
-    """options: of every recording (its own is the first). recordings: as they were given.
+    """A command line.
 
-    jobs, ray: see fleet.FleetOptions.
+    Attributes:
+        recordings: As they were given.
+        job: What every recording is replayed with; its source reads the first.
+        topics: Image topics of each recording.
+        batch: How several recordings are replayed.
     """
 
-    options: ReplayOptions
     recordings: tuple[Path, ...]
-    jobs: int
-    ray: str | None
-
-
-def split(options: ReplayOptions) -> list[ReplayOptions]:
-    """One Options per image topic when there are several, each with a folder of its own.
-
-    Raises RecordingError as image_topics does.
-    """
-    topics = options.image_topics
-    if options.all_topics:
-        topics = tuple(topic for topic in image_topics(options.recording) if topic)
-    if not topics:
-        return [replace(options, all_topics=False)]
-    return [
-        replace(
-            options,
-            image_topic=topic,
-            image_topics=(),
-            all_topics=False,
-            out=options.out / topic.strip("/").replace("/", "_"),
-        )
-        for topic in topics
-    ]
+    job: ReplayJob
+    topics: TopicChoice
+    batch: BatchOptions
 
 
 def parse(arguments: Sequence[str] | None = None) -> Command:
-    """Command line -> Command; ends the process with code 2 on a wrong one."""
+    """Read a command line; a wrong one ends the process with code 2.
+
+    Args:
+        arguments: Without the program's name; None: those of the process.
+
+    Returns:
+        What it asks for.
+    """
+    parser = _parser()
+    given = vars(parser.parse_args(arguments))
+    _check(parser, given)
+    recordings, names = tuple(given["recordings"]), tuple(given["image_topics"])
+    chosen: Run | PredictionTopic = Run(**_of(Run, given))
+    if given["prediction_topic"] is not None:
+        chosen = PredictionTopic(given["prediction_topic"], given["quantity"] or DEPTH)
+    alone = names[0] if len(names) == 1 else None
+    source = Source(recording=recordings[0], image_topic=alone, **_of(Source, given))
+    job = ReplayJob(source, chosen, Outputs(**_of(Outputs, given)))
+    topics = TopicChoice(() if alone else names, given["all_topics"])
+    return Command(recordings, job, topics, BatchOptions(**_of(BatchOptions, given)))
+
+
+def _of(kind: type[Any], given: dict[str, Any]) -> dict[str, Any]:
+    """The arguments that are fields of a dataclass."""
+    return {one.name: given[one.name] for one in fields(kind) if one.name in given}
+
+
+def _check(parser: argparse.ArgumentParser, given: dict[str, Any]) -> None:
+    """Refuse contradictions, and name options that have no effect."""
+    if given["image_topics"] and given["all_topics"]:
+        parser.error("--all-topics does not go with --image-topic")
+    if given["prediction_topic"] is None:
+        if given["quantity"] is not None:
+            parser.error("--quantity describes --prediction-topic, which is not given")
+        if given["compare"] and not given["stabilizer"]:
+            parser.error("--compare has no effect with --no-stabilizer: both runs are the same")
+        return
+    for name in ("compare", "controls"):
+        if given[name]:
+            parser.error(f"--{name} needs a model, and --prediction-topic runs none")
+    names = [one.name for one in fields(Run) if given[one.name] != parser.get_default(one.name)]
+    idle = [_NEGATED.get(name, f"--{name.replace('_', '-')}") for name in names]
+    if idle:
+        text = f"{', '.join(idle)}: no effect with --prediction-topic, which runs no model"
+        print(f"{parser.prog}: warning: {text}", file=sys.stderr)
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dyfn-replay",
         description="Run recordings through the model, as the node would, and score them.",
-        epilog="Exit code: 0 everything was read, 3 part of the recording was damaged and the "
-        "rest was used, 2 nothing usable (the reason is on stderr). Of several recordings or "
-        "topics: 0 all are whole, 3 some are partial or failed, 2 none gave results.",
+        epilog=EPILOG,
     )
-    add = parser.add_argument
-    add(
+    parser.add_argument(
         "recordings",
         type=Path,
         nargs="+",
@@ -104,34 +116,115 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
         help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder; several, a folder of them, "
         "or a .txt file that lists them",
     )
-    add("--out", type=Path, required=True, help="folder for the results")
-    _add_model_options(parser)
-    _add_input_options(parser)
-    _add_output_options(parser)
-    add("--jobs", type=at_least_one, default=1, help="processes for several recordings")
-    add("--ray", metavar="ADDRESS", help='Ray cluster for several recordings; "local" makes one')
-    given = vars(parser.parse_args(arguments))
-    recordings, jobs, ray = (given.pop(name) for name in ("recordings", "jobs", "ray"))
-    topics = tuple(given.pop("image_topics"))
-    if given["quantity"] is None:
-        given["quantity"] = DEPTH
-    elif given["prediction_topic"] is None:
-        parser.error("--quantity is of --prediction-topic, which is not given")
-    if given["prediction_topic"] is not None and given["controls"]:
-        parser.error("--controls need a model, --prediction-topic has none")
-    if topics and given["all_topics"]:
-        parser.error("--all-topics does not go with --image-topic")
-    if len(topics) == 1:
-        given["image_topic"] = topics[0]
-    else:
-        given["image_topics"] = topics
-    return Command(ReplayOptions(recordings[0], **given), tuple(recordings), jobs, ray)
+    _add_source(parser.add_argument_group("source", "what is read of a recording"))
+    _add_stream(parser.add_argument_group("stream", "what the stream does, as the node's"))
+    _add_run(parser.add_argument_group("run", "what is run over the frames"))
+    _add_outputs(parser.add_argument_group("outputs", "what is scored and written"))
+    _add_batch(parser.add_argument_group("batch", "how several recordings are replayed"))
+    return parser
 
 
-def _add_model_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--model", default="dyfn-mini", help="bundled name, checkpoint file, or Hub id")
+def _add_source(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--image-topic",
+        dest="image_topics",
+        action="append",
+        default=[],
+        metavar="TOPIC",
+        help="colour image, raw or compressed; may be given several times, see --all-topics "
+        "(default: found by type)",
+    )
+    add(
+        "--all-topics",
+        action="store_true",
+        help="replay every colour image topic, a stream and a folder below --out for each",
+    )
+    add(
+        "--camera-info-topic",
+        metavar="TOPIC",
+        help='its CameraInfo; "none" for unknown intrinsics (default: found by type)',
+    )
+    add(
+        "--depth-topic",
+        metavar="TOPIC",
+        help='ground truth: depth images (16UC1 mm, 32FC1 m, compressed) or a PointCloud2; "none" '
+        "for no scores (default: found by type, depth images only)",
+    )
+    add(
+        "--depth-info-topic",
+        metavar="TOPIC",
+        help="CameraInfo of a depth camera that is not the image's",
+    )
+    add(
+        "--depth-transform",
+        metavar="'X Y Z QX QY QZ QW'",
+        help="pose of the depth camera or of the cloud's sensor in the image's optical frame, "
+        "metres",
+    )
+    add(
+        "--tolerance",
+        type=above_zero,
+        default=0.02,
+        metavar="SECONDS",
+        help="largest difference of the stamps of an image and its ground truth (default: 0.02)",
+    )
+    add(
+        "--stamps",
+        choices=("header", "log"),
+        default="header",
+        help="times of the messages' headers, or times of recording (default: header)",
+    )
+    add(
+        "--stride",
+        type=at_least_one,
+        default=1,
+        metavar="N",
+        help="take every N-th frame (default: 1)",
+    )
+    add(
+        "--max-frames",
+        type=at_least_one,
+        metavar="N",
+        help="stop after N frames (default: all)",
+    )
+
+
+def _add_stream(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
+    add(
+        "--num-tokens",
+        type=at_least_one,
+        metavar="N",
+        help="resolution inside the model, in tokens (default: the model's own)",
+    )
+    add(
+        "--scene-cut-threshold",
+        type=above_zero,
+        default=0.0,
+        metavar="DIFFERENCE",
+        help="reset the stream at scene cuts, as the node does (its default: 0.6); by default do "
+        "not",
+    )
+
+
+def _add_run(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--model",
+        default="dyfn-mini",
+        help="bundled name, checkpoint file, or Hub id (default: dyfn-mini)",
+    )
+    add("--device", default="cpu", help="cpu, cuda or cuda:N (default: cpu)")
+    add(
+        "--threads",
+        type=not_negative,
+        default=THREADS,
+        metavar="N",
+        help="CPU threads for inference, on which the result does not depend "
+        f"(default: {THREADS}; 0: torch's own choice)",
+    )
     add("--compare", action="store_true", help="also run the base model, for one report on both")
     add(
         "--controls",
@@ -139,47 +232,10 @@ def _add_model_options(parser: argparse.ArgumentParser) -> None:
         help="also run the model with a moving average of the latent's statistics, and with those "
         "of the first frame, in DyFN's place; each takes as long as the run itself",
     )
-    add("--num-tokens", type=at_least_one, help="resolution inside the model")
-    add("--device", default="cpu", help="cpu, cuda, cuda:N")
-    add(
-        "--threads",
-        type=not_negative,
-        default=THREADS,
-        help="CPU threads for inference, on which the result does not depend "
-        f"(default: {THREADS}; 0: torch's own choice)",
-    )
-    add(
-        "--scene-cut-threshold",
-        type=above_zero,
-        default=0.0,
-        help="start anew at scene cuts, as the node does (its default: 0.6); by default do not",
-    )
-
-
-def _add_input_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--image-topic",
-        dest="image_topics",
-        action="append",
-        default=[],
-        metavar="TOPIC",
-        help="colour image, raw or compressed; may be given several times, see --all-topics",
-    )
-    add(
-        "--all-topics",
-        action="store_true",
-        help="replay every colour image topic, a stream and a folder below --out for each",
-    )
-    add("--camera-info-topic", help='its CameraInfo; "none" for an unknown camera')
-    add(
-        "--depth-topic",
-        help='ground truth: depth images (16UC1 mm, 32FC1 m, compressed) or a PointCloud2; "none" '
-        "for no scores",
-    )
     add(
         "--prediction-topic",
-        help="score the depth images of this topic, whoever made them, instead of a model's",
+        metavar="TOPIC",
+        help="run no model: score the depth images of this topic, whoever made them",
     )
     add(
         "--quantity",
@@ -187,26 +243,18 @@ def _add_input_options(parser: argparse.ArgumentParser) -> None:
         help="what the prediction topic holds. depth (default); disparity: a / depth + b; "
         "inverse: a / depth",
     )
-    add("--depth-info-topic", help="CameraInfo of a depth camera that is not the image's")
-    add(
-        "--depth-transform",
-        metavar="'X Y Z QX QY QZ QW'",
-        help="pose of the depth camera or of the cloud's sensor in the image's optical frame",
-    )
-    add("--depth-max", type=above_zero, default=math.inf, help="cap of the ground truth, metres")
-    add("--tolerance", type=above_zero, default=0.02, help="seconds from image to ground truth")
-    add(
-        "--stamps",
-        choices=("header", "log"),
-        default="header",
-        help="times from the messages' headers, or the times of recording",
-    )
-    add("--max-frames", type=at_least_one, help="stop after so many frames")
-    add("--stride", type=at_least_one, default=1, help="take every N-th frame")
 
 
-def _add_output_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
+def _add_outputs(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--out",
+        dest="folder",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="folder for the results",
+    )
     add(
         "--write",
         type=_outputs,
@@ -216,8 +264,41 @@ def _add_output_options(parser: argparse.ArgumentParser) -> None:
         f"(default: {','.join(DEFAULT)})",
     )
     add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
-    add("--pose-topic", help='poses, odometry or TF for cloud.ply; "none" for no cloud')
-    add("--voxel", type=above_zero, default=VOXEL, help="voxels of cloud.ply, metres")
+    add(
+        "--pose-topic",
+        metavar="TOPIC",
+        help='poses, odometry or TF for cloud.ply; "none" for no cloud (default: found by type)',
+    )
+    add(
+        "--voxel",
+        type=above_zero,
+        default=VOXEL,
+        metavar="METRES",
+        help=f"edge of a voxel of cloud.ply (default: {VOXEL})",
+    )
+    add(
+        "--depth-max",
+        type=above_zero,
+        default=math.inf,
+        metavar="METRES",
+        help="leave out ground truth and points of cloud.ply beyond this depth (default: none)",
+    )
+
+
+def _add_batch(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
+    add(
+        "--jobs",
+        type=at_least_one,
+        default=1,
+        metavar="N",
+        help="worker processes (default: 1)",
+    )
+    add(
+        "--ray",
+        metavar="ADDRESS",
+        help='send the recordings to this Ray cluster; "local" makes one on this machine',
+    )
 
 
 def _outputs(text: str) -> tuple[str, ...]:

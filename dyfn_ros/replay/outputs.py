@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
-import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -22,36 +19,8 @@ from dyfn_ros.replay.cloud import write_cloud
 from dyfn_ros.replay.frame_spool import FrameSpool
 from dyfn_ros.replay.mcap import ReplayRecording
 from dyfn_ros.replay.rerun import RerunRecording
+from dyfn_ros.replay.settings import FILES, MCAP, NONE, PLY, RRD, VIDEO, Outputs
 from dyfn_ros.replay.video import Alignment, write_video
-
-MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
-FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}
-# The video comes by itself only where the extra `video` is installed.
-DEFAULT = (MCAP, PLY, VIDEO) if importlib.util.find_spec("av") else (MCAP, PLY)
-NONE = "none"
-VOXEL = 0.02  # metres
-
-
-def parse_outputs(text: str) -> tuple[str, ...]:
-    """ "mcap,ply" -> their names, each once, in the order of FILES; "none" -> ().
-
-    Raises ValueError that lists the known ones.
-    """
-    names = {name.strip() for name in text.split(",")} - {NONE}
-    unknown = sorted(names - FILES.keys())
-    if unknown:
-        raise ValueError(f"unknown output {unknown[0]!r}, expected some of {', '.join(FILES)}")
-    return tuple(name for name in FILES if name in names)
-
-
-@dataclass(frozen=True)
-class OutputOptions:
-    """write: names of FILES. pose_topic: see open_poses. voxel, depth_max: metres, of the cloud."""
-
-    write: tuple[str, ...] = DEFAULT
-    pose_topic: str | None = None
-    voxel: float = VOXEL
-    depth_max: float = math.inf
 
 
 class _Writer(Protocol):
@@ -63,20 +32,21 @@ class _Writer(Protocol):
 class ReplayOutputs:
     """Takes a replay's frames and leaves the chosen files in a folder, each only when complete.
 
-    recording: what is replayed; its poses are looked for in it. warn: takes a reason for what is
-    not written, or not whole. After an exception none of the files is left behind. cloud: after
-    finish, the fused cloud seen from above (H x W x 3 uint8 RGB), if there is one. Raises
-    OutputError for a file that cannot be written, or a library that is missing.
+    options: folder, files and their parameters. recording: what is replayed; its poses are looked
+    for in it. warn: takes a reason for what is not written, or not whole. After an exception none
+    of the files is left behind. cloud: after finish, the fused cloud seen from above (H x W x 3
+    uint8 RGB), if there is one. Raises OutputError for a file that cannot be written, or a library
+    that is missing.
     """
 
     def __init__(
         self,
-        folder: Path,
+        options: Outputs,
         recording: Path,
-        options: OutputOptions,
         warn: Callable[[str], None],
     ) -> None:
-        self._folder, self._recording, self._options, self._warn = folder, recording, options, warn
+        self._options, self._recording, self._warn = options, recording, warn
+        self._folder = options.folder
         self._writers: list[tuple[Path, _Writer]] = []
         self._spool: FrameSpool | None = None
         self._poses: PoseLookup | None = None
@@ -130,7 +100,7 @@ class ReplayOutputs:
     def finish(self, alignment: Alignment | None, quantity: str = DEPTH) -> None:
         """Write what needs the alignment of the whole sequence; None when there is no truth.
 
-        quantity: what the model says, depth or disparity.
+        quantity: what the model predicts, depth or disparity.
         """
         spool = self._spool
         if spool is not None and spool.frames and VIDEO in self._options.write:
@@ -158,7 +128,7 @@ class ReplayOutputs:
             try:
                 self._poses = open_poses(self._recording, frame.frame_id, topic)
             except PoseError as error:
-                if topic not in (None, "none"):
+                if topic not in (None, NONE):
                     raise
                 self._fuse = False
                 self._notes.append(f"no cloud.ply: {error}")

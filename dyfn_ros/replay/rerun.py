@@ -35,8 +35,8 @@ class RerunRecording:
     """Entities: camera (pinhole), camera/image (JPEG), camera/depth, points; scores/NAME for each
     of score_values.
 
-    On the timelines `stamp` and `frame`. Depth and points are as the model said them, up to
-    scale. The library writes in a thread of its own, which only logs a full disk and has been seen
+    On the timelines `stamp` and `frame`. Depth and points are in the unit of the model.
+    The library writes in a thread of its own, which only logs a full disk and has been seen
     never to return from one: a disk with less than ROOM is an OutputError before that. The file is
     read back at the end, and an incomplete one is an OutputError too.
     """

@@ -1,4 +1,4 @@
-"""What a replay says in the end: metrics.json, frames.csv, strip.png and report.html."""
+"""The results of a replay: metrics.json, frames.csv, strip.png and report.html."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +16,9 @@ from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import COLUMNS, SequenceEvaluation
 from dyfn_core.files import finished_file
-from dyfn_ros.recordings.open import Recording
-
-if TYPE_CHECKING:
-    from dyfn_ros.replay.options import ReplayOptions
-
+from dyfn_core.scoring.protocols import CONTROLS
+from dyfn_ros.recordings.frames import Recording
+from dyfn_ros.replay.settings import Outputs, Source
 
 CONTROLS_NOTE = (
     " The others put a moving average of the latent's statistics (ema), or those of the first "
@@ -32,40 +30,56 @@ CONTROLS_NOTE = (
 class Result:
     """A replay that has ended.
 
-    name: of the model, or the topic of the predictions. stabilized: with DyFN. base: the same
-    frames without DyFN, if they were run. threads: that computed, 0 where no model ran. cloud:
-    picture of the fused cloud, H x W x 3 uint8 RGB.
+    Attributes:
+        name: Of the model, or the topic of the predictions.
+        stabilized: Whether DyFN took part.
+        evaluation: Of every frame.
+        base: Of the same frames without DyFN; None: not run.
+        options: What the run adds to the `options` of metrics.json.
+        cloud: Picture of the fused cloud, H x W x 3 uint8 RGB; None: no cloud.
     """
 
-    recording: Recording
     name: str
     stabilized: bool
     evaluation: SequenceEvaluation
     base: SequenceEvaluation | None
-    threads: int
+    options: dict[str, Any]
     cloud: np.ndarray | None
 
 
-def write_results(options: ReplayOptions, result: Result) -> dict[str, Any]:
-    """Write scores, table, strip and report into options.out; -> metrics.json's content.
+def write_results(
+    source: Source, recording: Recording, outputs: Outputs, result: Result
+) -> dict[str, Any]:
+    """Write scores, table, strip and report.
 
-    Raises OutputError.
+    Args:
+        source: What was read.
+        recording: The same, opened and read to its end.
+        outputs: Where results go.
+        result: What was found.
+
+    Returns:
+        The content of metrics.json.
+
+    Raises:
+        OutputError: A file cannot be written.
     """
-    metrics = _metrics(options, result)
-    with finished_file(options.out / "strip.png") as partial:
+    folder, metrics = outputs.folder, _metrics(source, recording, outputs, result)
+    with finished_file(folder / "strip.png") as partial:
         partial.write_bytes(encode_picture(result.evaluation.draw_strip()))
-    with finished_file(options.out / "frames.csv") as partial:
+    with finished_file(folder / "frames.csv") as partial:
         _write_rows(partial, result.evaluation)
-    with finished_file(options.out / "report.html") as partial:
-        _write_report(partial, options, metrics, result)
+    with finished_file(folder / "report.html") as partial:
+        _write_report(partial, metrics, result)
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
-    with finished_file(options.out / "metrics.json") as partial:
+    with finished_file(folder / "metrics.json") as partial:
         partial.write_text(text, encoding="utf-8")
     return metrics
 
 
-def _metrics(options: ReplayOptions, result: Result) -> dict[str, Any]:
-    recording = result.recording
+def _metrics(
+    source: Source, recording: Recording, outputs: Outputs, result: Result
+) -> dict[str, Any]:
     results = result.evaluation.results()
     return {
         "frames": results.pop("frames"),
@@ -75,22 +89,19 @@ def _metrics(options: ReplayOptions, result: Result) -> dict[str, Any]:
         **results,
         **({} if result.base is None else {"base": result.base.results()}),
         "recording": {
-            "path": str(options.recording),
+            "path": str(source.recording),
             "topics": vars(recording.topics),
             "losses": dict(recording.notes.losses),
             "warnings": dict(recording.notes.warnings),
         },
         "options": {
-            "stride": options.stride,
-            "max_frames": options.max_frames,
-            "num_tokens": options.num_tokens,
-            "scene_cut_threshold": options.scene_cut_threshold,
-            "stamps": options.stamps,
-            "tolerance": options.tolerance,
-            "depth_transform": options.depth_transform,
-            "threads": result.threads,
-            "depth_max": None if math.isinf(options.depth_max) else options.depth_max,
-            **({} if options.prediction_topic is None else {"predicted": options.quantity}),
+            "stride": source.stride,
+            "max_frames": source.max_frames,
+            "stamps": source.stamps,
+            "tolerance": source.tolerance,
+            "depth_transform": source.depth_transform,
+            "depth_max": None if math.isinf(outputs.depth_max) else outputs.depth_max,
+            **result.options,
         },
     }
 
@@ -102,31 +113,31 @@ def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
         writer.writerows(evaluation.rows())
 
 
-def _write_report(
-    path: Path, options: ReplayOptions, metrics: dict[str, Any], result: Result
-) -> None:
+def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
+    recording = metrics["recording"]
     facts: list[list[str | float | int | None]] = [
-        ["recording", str(options.recording)],
+        ["recording", recording["path"]],
         ["frames", metrics["frames"]],
         ["model", metrics["model"]],
         ["DyFN", "on" if metrics["stabilizer"] else "off"],
         ["valid share of the pixels with truth", metrics["coverage"]],
         ["output SHA-256", metrics["output_sha256"][:16]],
-        *([topic, value] for topic, value in metrics["recording"]["topics"].items()),
+        *([topic, value] for topic, value in recording["topics"].items()),
         *([name, value] for name, value in metrics["options"].items() if value is not None),
     ]
-    notes = metrics["recording"]["losses"] | metrics["recording"]["warnings"]
+    notes = recording["losses"] | recording["warnings"]
     name = run_name(metrics)
     runs = {name: result.evaluation}
     if result.base is not None:
         runs[run_name({**metrics, "stabilizer": False})] = result.base
     clouds = {} if result.cloud is None else {f"{name}, fused, from above": result.cloud}
-    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if options.controls else "")
+    controlled = result.evaluation.scores.controls.keys() > CONTROLS.keys()
+    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if controlled else "")
     if notes:
         rows = [[text, count] for text, count in notes.items()]
         sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))
     sections.append(Section("What was run", [Table(("", ""), facts)]))
-    write_report(path, f"Replay of {options.recording.name}", sections)
+    write_report(path, f"Replay of {Path(recording['path']).name}", sections)
 
 
 def run_name(metrics: dict[str, Any]) -> str:

@@ -30,9 +30,9 @@ class Alignment:
     shift: float = 0.0
     quantity: str = "depth"
 
-    def depth(self, said: np.ndarray) -> np.ndarray:
-        """H x W as the model said it -> aligned depth."""
-        return align_depth(said, self.scale, self.shift, self.quantity)
+    def depth(self, predicted: np.ndarray) -> np.ndarray:
+        """H x W depth or disparity, as predicted -> aligned depth."""
+        return align_depth(predicted, self.scale, self.shift, self.quantity)
 
 
 def write_video(path: Path, spool: FrameSpool, alignment: Alignment) -> None:
@@ -97,14 +97,14 @@ class _Colours:
         truths, depths = [], []
         for index, frame in enumerate(spool):
             if index % every == 0:
-                depths.append(alignment.depth(frame.said))
+                depths.append(alignment.depth(frame.predicted))
                 truths += [] if frame.truth is None else [frame.truth]
         self._error = bool(truths)
         self._near, self._far = depth_range(truths or depths)
 
     def draw(self, frame: SmallFrame) -> np.ndarray:
         """Rows and columns x 3 uint8 RGB, both even as yuv420p asks for."""
-        depth = self._alignment.depth(frame.said)
+        depth = self._alignment.depth(frame.predicted)
         panels = {"input": frame.image}
         unit = "m" if self._error else "(up to scale)"
         panels[f"depth {self._near:.2g} to {self._far:.2g} {unit}"] = colour_depth(

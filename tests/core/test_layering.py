@@ -10,15 +10,15 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-_WORDS = {"prediction", "files", "threads", "argument_types"}
+_WORDS = {"prediction", "quantities", "files", "threads", "argument_types"}
 _MODELS = _WORDS | {"geometry", "models"}
 # Room -> the rooms of the same package that it may import. A room is the first name below the
 # package. docs/pictures/rooms.svg is drawn from this table: python -m tests.support.rooms_picture
 ROOMS: dict[str, dict[str, set[str]]] = {
     "dyfn_core": {
-        **{word: set() for word in ("files", "threads", "argument_types")},
+        **{word: set() for word in ("quantities", "files", "threads", "argument_types")},
         "geometry": _WORDS - {"prediction"},
-        "prediction": {"geometry"},
+        "prediction": {"geometry", "quantities"},
         "metric": _WORDS | {"geometry"},
         "models": _WORDS | {"geometry"},
         "scoring": _WORDS | {"geometry"},

@@ -14,35 +14,14 @@ from dyfn_core.data.files import read_exr, read_uint16
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.arrays import frames_of_array, npz_key
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.prediction import DEPTH, DISPARITY
+from dyfn_core.quantities import scored_quantity, scored_values
 
-INVERSE = "inverse"
-QUANTITIES = (DEPTH, DISPARITY, INVERSE)
 ARRAYS = (".npz", ".npy")
 FRAME_FILES = (".npz", ".npy", ".png", ".exr")
 KEYS = ("depth", "disparity", "inverse", "prediction", "arr_0")
 
 Predict = Callable[[int, BenchmarkFrame], Mapping[str, np.ndarray]]
 OpenArrays = Callable[[BenchmarkSequence], Iterator[np.ndarray]]
-
-
-def scored_quantity(kind: str) -> str:
-    """How values of one of QUANTITIES are aligned: disparity as such, the others as depth."""
-    if kind not in QUANTITIES:
-        raise DataError(f"quantity {kind!r} is unknown, expected one of {QUANTITIES}")
-    return DISPARITY if kind == DISPARITY else DEPTH
-
-
-def scored_values(values: np.ndarray, kind: str) -> np.ndarray:
-    """Values of one of QUANTITIES -> what scored_quantity says, float32 of the same shape.
-
-    Inverse depth has no unknown offset and becomes depth, NaN where it is not positive.
-    """
-    values = np.asarray(values, np.float32)
-    if kind != INVERSE:
-        return values
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(values > 0, 1 / values, np.float32(np.nan))
 
 
 class Method(Protocol):
@@ -81,7 +60,10 @@ class ArrayMethod:
     open_arrays: OpenArrays
 
     def __post_init__(self) -> None:
-        scored_quantity(self.kind)  # raises
+        try:
+            scored_quantity(self.kind)
+        except ValueError as error:
+            raise DataError(str(error)) from error
 
     @property
     def quantity(self) -> str:

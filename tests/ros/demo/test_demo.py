@@ -13,7 +13,7 @@ import pytest
 from dyfn_ros.demo.cli import FAILED, OK, UNUSABLE, main
 from dyfn_ros.demo.node_process import LiveError, NodeExitError, NodeProcess
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
-from dyfn_ros.replay import run as replay
+from dyfn_ros.replay import cli as replay
 from tests.support.rgbd_frames import rgbd
 from tests.support.ros_graph import DEADLINE, own_domain
 from tests.support.tiny_model import load_tiny

@@ -3,7 +3,9 @@
 import csv
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,13 +13,13 @@ import pytest
 
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
-from dyfn_ros.replay import batch as fleet
+from dyfn_ros.replay import batch
 from dyfn_ros.replay.batch import expand, is_many, plan, run_locally
 from dyfn_ros.replay.batch_summary import mean_of
 from dyfn_ros.replay.cli import main
-from dyfn_ros.replay.jobs import CRASHED, Outcome
-from dyfn_ros.replay.options import ReplayOptions
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, replay
+from dyfn_ros.replay.jobs import ALL, CRASHED, PARTIAL, UNUSABLE, Outcome, outcome_of
+from dyfn_ros.replay.run import replay
+from dyfn_ros.replay.settings import Outputs, PredictionTopic, ReplayJob, Run, Source, TopicChoice
 from tests.support.tiny_model import load_tiny
 
 CAMERA = np.array([[40.0, 0, 23.5], [0, 40.0, 17.5], [0, 0, 1]])
@@ -50,10 +52,14 @@ def here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def run(jobs, loader, workers):  # type: ignore[no-untyped-def]
         for job in jobs:
             ran.append(job.name)
-            yield job, fleet.run_one(job.options, loader)
+            yield job, outcome_of(job.job, loader)
 
-    monkeypatch.setattr(fleet, "run_locally", run)
+    monkeypatch.setattr(batch, "run_locally", run)
     return ran
+
+
+def job_of(recording: Path, out: Path) -> ReplayJob:
+    return ReplayJob(Source(recording), Run(model="tiny"), Outputs(out, write=()))
 
 
 def run(out: Path, *arguments: object) -> int:
@@ -88,19 +94,29 @@ def test_a_list_names_recordings_beside_it(walks: Path) -> None:
 
 def test_equal_names_get_folders_of_their_own(tmp_path: Path) -> None:
     paths = [tmp_path / one / "walk.mcap" for one in ("x", "y", "x")]
-    jobs = plan(paths, ReplayOptions(tmp_path, tmp_path / "out"), "sum")
+    jobs = plan(paths, job_of(tmp_path, tmp_path / "out"), TopicChoice(), "sum")
     assert [job.name for job in jobs] == ["walk", "y_walk", "x_walk"]
-    assert len({job.options.out for job in jobs}) == 3
+    assert len({job.job.outputs.folder for job in jobs}) == 3
 
 
 def test_the_key_is_of_options_model_and_files(walks: Path, tmp_path: Path) -> None:
-    def key(checksum: str = "sum", **changed: object) -> str:
-        options = ReplayOptions(walks, tmp_path / "out", **changed)  # type: ignore[arg-type]
-        return plan([walks / "b.mcap"], options, checksum)[0].key
+    usual = job_of(walks, tmp_path / "out")
+
+    def key(fingerprint: str = "sum", **changed: object) -> str:
+        job = replace(usual, **changed)  # type: ignore[arg-type]
+        return plan([walks / "b.mcap"], job, TopicChoice(), fingerprint)[0].key
 
     first = key()
-    assert first == key() == key(threads=2, progress=False)
-    assert len({first, key("other"), key(stride=2), key(write=())}) == 4
+    moved = Outputs(tmp_path / "elsewhere", write=(), progress=False)
+    assert first == key() == key(outputs=moved)
+    others = [
+        key("other"),
+        key(source=Source(walks, stride=2)),
+        key(run=Run(model="tiny", controls=True)),
+        key(run=PredictionTopic("/depth")),
+        key(outputs=Outputs(tmp_path / "out")),
+    ]
+    assert len({first, *others}) == 6
     os.utime(walks / "b.mcap", ns=(1, 1))
     assert key() != first
 
@@ -181,14 +197,19 @@ def test_a_worker_that_dies_takes_no_other_along(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "die").touch()
-    options = ReplayOptions(walks, tmp_path / "out", model="tiny", write=())
-    jobs = plan([walks / "a", walks / "c"], options, "sum")
+    job = job_of(walks, tmp_path / "out")
+    jobs = plan([walks / "a", walks / "c"], job, TopicChoice(), "sum")
     found = {outcome.code: (job, outcome) for job, outcome in run_locally(jobs, dying_loader, 2)}
     assert found[CRASHED][1] == Outcome(CRASHED, "its process ended with code -9")
-    survivor = found[ALL][0].options
-    other = json.loads((survivor.out / "metrics.json").read_text())
-    alone = ReplayOptions(survivor.recording, tmp_path / "alone", model="tiny", write=())
-    assert other["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
+    survivor = found[ALL][0].job
+    other = json.loads((survivor.outputs.folder / "metrics.json").read_text())
+    assert other["output_sha256"] == alone(survivor.source.recording, tmp_path)["output_sha256"]
+
+
+def alone(recording: Path, folder: Path) -> dict[str, Any]:
+    """metrics.json of a replay outside of any batch."""
+    outputs = Outputs(folder / "alone", write=())
+    return replay(Source(recording), Run(model="tiny"), outputs, load_tiny)
 
 
 def test_ray_does_the_same(
@@ -204,8 +225,7 @@ def test_ray_does_the_same(
     assert run(tmp_path / "out", *chosen, "--ray", "local") == PARTIAL
     assert "broken.mcap: failed (code 2)" in capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "a" / "metrics.json").read_text())
-    alone = ReplayOptions(walks / "a", tmp_path / "alone", model="tiny", write=())
-    assert found["output_sha256"] == replay(alone, load_tiny)["output_sha256"]
+    assert found["output_sha256"] == alone(walks / "a", tmp_path)["output_sha256"]
 
 
 def test_ray_that_is_missing_is_named(

@@ -55,7 +55,7 @@ def offline(folder: Path) -> dict[str, Path]:
     command = [
         sys.executable,
         "-m",
-        "dyfn_ros.replay.run",
+        "dyfn_ros.replay.cli",
         str(folder / "walk"),
         str(folder / "rest"),
     ]

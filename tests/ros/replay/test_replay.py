@@ -1,7 +1,10 @@
 """dyfn-replay: what it writes is right, complete and the same each time."""
 
 import csv
+import itertools
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,8 +28,10 @@ from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
+from dyfn_ros.replay.jobs import ALL, PARTIAL, UNUSABLE
 from dyfn_ros.replay.options import parse
-from dyfn_ros.replay.run import ALL, PARTIAL, UNUSABLE, load
+from dyfn_ros.replay.run import load
+from dyfn_ros.replay.settings import PredictionTopic
 from tests.support.rgbd_frames import CAMERA, SIZE, rgbd
 from tests.support.tiny_model import load_tiny
 
@@ -313,10 +318,58 @@ def test_controls_of_the_latent_are_run_when_asked_for(recording: Path, tmp_path
     assert "control: ema" not in (tmp_path / "plain" / "report.html").read_text()
 
 
-def test_controls_need_a_model(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("option", ["--controls", "--compare"])
+def test_a_prediction_topic_runs_no_model(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    topic = ["walk", "--out", "out", "--prediction-topic", "/other/depth"]
     with pytest.raises(SystemExit):
-        parse(["walk", "--out", "out", "--prediction-topic", "/other/depth", "--controls"])
-    assert "--controls need a model" in capsys.readouterr().err
+        parse([*topic, option])
+    assert f"{option} needs a model" in capsys.readouterr().err
+    assert parse(topic).job.run == PredictionTopic("/other/depth")
+    assert capsys.readouterr().err == ""
+    parse([*topic, "--model", "tiny", "--no-stabilizer"])
+    assert "--model, --no-stabilizer: no effect" in capsys.readouterr().err
+
+
+def test_a_comparison_of_the_base_model_with_itself_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        parse(["walk", "--out", "out", "--no-stabilizer", "--compare"])
+    assert "both runs are the same" in capsys.readouterr().err
+
+    def base(name: str, device: str) -> Any:
+        model = load_tiny()
+        model.stabilizer = None
+        return model
+
+    command = [str(recording), "--out", str(tmp_path / "out"), "--model", "tiny", "--compare"]
+    assert main([*command, "--write", "none"], base) == ALL
+    assert "base" not in metrics(tmp_path / "out")
+    assert "nothing to compare" in capsys.readouterr().err
+
+
+def test_help_and_options_come_without_torch(tmp_path: Path) -> None:
+    slow = "[m for m in ('torch', 'matplotlib', 'rosbags', 'scipy') if m in sys.modules]"
+    code = f"import sys, dyfn_ros.replay.options, dyfn_ros.replay.cli; print({slow})"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_help_names_every_group_and_explains_every_option(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        parse(["--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    for group in ("source", "stream", "run", "outputs", "batch"):
+        assert f"\n{group}:\n" in text
+    lines = text[text.index("\nsource:") :].splitlines()
+    for line, after in itertools.pairwise(lines):
+        if line.startswith("  -") and "  " not in line.strip():
+            assert after.startswith("          "), f"{line} has no help"
 
 
 def drifting(truth: np.ndarray, index: int) -> np.ndarray:
@@ -468,7 +521,7 @@ def test_a_prediction_is_not_scored_against_itself(
 def test_a_quantity_needs_a_prediction_topic(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         parse(["walk", "--out", "out", "--quantity", "inverse"])
-    assert "--quantity is of --prediction-topic" in capsys.readouterr().err
+    assert "--quantity describes --prediction-topic" in capsys.readouterr().err
 
 
 def test_a_prediction_topic_that_is_not_there_is_named(

@@ -14,7 +14,7 @@ from dyfn_core.geometry import voxel_grid
 from dyfn_core.scoring import protocols
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.replay.cli import main
-from dyfn_ros.replay.run import ALL
+from dyfn_ros.replay.jobs import ALL
 from tests.support.tiny_model import load_tiny
 from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
 

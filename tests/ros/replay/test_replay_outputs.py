@@ -25,9 +25,10 @@ from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording as record
 from dyfn_ros.recordings.typestore import TYPES, header
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
-from dyfn_ros.replay.outputs import FILES, OutputOptions, ReplayOutputs
+from dyfn_ros.replay.jobs import ALL, UNUSABLE
+from dyfn_ros.replay.outputs import ReplayOutputs
 from dyfn_ros.replay.rerun import ROOM
-from dyfn_ros.replay.run import ALL, UNUSABLE
+from dyfn_ros.replay.settings import FILES, Outputs
 from dyfn_ros.replay.video import Alignment
 from tests.support.tiny_model import load_tiny
 from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
@@ -63,8 +64,8 @@ def written(tmp_path: Path) -> Callable[..., list[str]]:
         record(tmp_path / "walk", frames, jpeg_quality=None, overwrite=True)
         (tmp_path / "out").mkdir(exist_ok=True)
         warnings: list[str] = []
-        chosen = OutputOptions(**options)
-        with ReplayOutputs(tmp_path / "out", tmp_path / "walk", chosen, warnings.append) as outputs:
+        chosen = Outputs(tmp_path / "out", **options)
+        with ReplayOutputs(chosen, tmp_path / "walk", warnings.append) as outputs:
             for frame in open_recording(tmp_path / "walk").frames():
                 depth = WALL - 0.3 * frame.index + np.zeros(SIZE)
                 outputs.write(frame, perfect_up_to(2.5, depth), FrameScore(1.0, 10))

@@ -1,0 +1,164 @@
+"""What to read, what to run and what to write: one value for each, handed to its owner alone.
+
+Nothing slow is imported here, so that `dyfn-replay --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from dyfn_core.quantities import DEPTH
+from dyfn_core.threads import THREADS
+
+MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
+FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}
+# The video is a default only where the extra `video` is installed.
+DEFAULT = (MCAP, PLY, VIDEO) if importlib.util.find_spec("av") else (MCAP, PLY)
+NONE = "none"
+VOXEL = 0.02  # metres
+
+
+@dataclass(frozen=True)
+class Source:
+    """What `reader.SourceReader` reads.
+
+    Attributes:
+        recording: rosbag2 folder, bag file or RGB-D folder.
+        image_topic: Colour image topic; None: found by type.
+        camera_info_topic: Its CameraInfo; None: found by type, "none": unknown intrinsics.
+        depth_topic: Ground truth; None: found by type, "none": no scores.
+        depth_info_topic: CameraInfo of a depth camera that is not the image's.
+        depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
+        stamps: Times of the headers, or of the log.
+        tolerance: Seconds between the stamps of an image and its ground truth.
+        stride: Every N-th frame is read.
+        max_frames: At most this many frames are read; None: all.
+    """
+
+    recording: Path
+    image_topic: str | None = None
+    camera_info_topic: str | None = None
+    depth_topic: str | None = None
+    depth_info_topic: str | None = None
+    depth_transform: str | None = None
+    stamps: Literal["header", "log"] = "header"
+    tolerance: float = 0.02
+    stride: int = 1
+    max_frames: int | None = None
+
+
+@dataclass(frozen=True)
+class Run:
+    """What `runner` runs over the frames.
+
+    Attributes:
+        model: Bundled name, checkpoint file or Hub id.
+        device: "cpu", "cuda" or "cuda:N".
+        threads: CPU threads of inference; 0: torch's own choice.
+        stabilizer: With DyFN; False: the base model alone.
+        num_tokens: Resolution inside the model; None: the model's own.
+        scene_cut_threshold: Difference of two images above which the stream resets; 0: never.
+        compare: Also run the base model, for one report on both.
+        controls: Also run DyFN's controls (models.controls.latent_controls).
+    """
+
+    model: str = "dyfn-mini"
+    device: str = "cpu"
+    threads: int = THREADS
+    stabilizer: bool = True
+    num_tokens: int | None = None
+    scene_cut_threshold: float = 0.0
+    compare: bool = False
+    controls: bool = False
+
+
+@dataclass(frozen=True)
+class PredictionTopic:
+    """A recorded topic that `score_topic` scores; no model runs.
+
+    Attributes:
+        topic: Images of predictions, whoever made them.
+        quantity: What they hold, one of quantities.QUANTITIES.
+    """
+
+    topic: str
+    quantity: str = DEPTH
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What is scored and written, and where: for `outputs` and `results`.
+
+    Attributes:
+        folder: Takes every file.
+        write: Names of FILES, beside scores and report.
+        pose_topic: Poses for cloud.ply, see recordings.poses.open_poses.
+        voxel: Edge of a voxel of cloud.ply, metres.
+        depth_max: Ground truth and points of cloud.ply beyond it (metres) are left out.
+        progress: Whether a progress bar is drawn on stderr.
+    """
+
+    folder: Path
+    write: tuple[str, ...] = DEFAULT
+    pose_topic: str | None = None
+    voxel: float = VOXEL
+    depth_max: float = math.inf
+    progress: bool = True
+
+
+@dataclass(frozen=True)
+class ReplayJob:
+    """One image topic of one recording: what to read, what to run or score, what to write."""
+
+    source: Source
+    run: Run | PredictionTopic
+    outputs: Outputs
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """Which image topics are replayed, each as a job of its own.
+
+    Attributes:
+        names: Topics; empty: the one of the Source.
+        every: Every colour image topic of the recording, instead of `names`.
+    """
+
+    names: tuple[str, ...] = ()
+    every: bool = False
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """How several recordings are replayed.
+
+    Attributes:
+        jobs: Worker processes on this machine.
+        ray: Address of a Ray cluster, "local" for one made here; None: no Ray.
+    """
+
+    jobs: int = 1
+    ray: str | None = None
+
+
+def parse_outputs(text: str) -> tuple[str, ...]:
+    """Read a list of outputs.
+
+    Args:
+        text: Names of FILES with commas between them, or "none".
+
+    Returns:
+        The names, each once, in the order of FILES.
+
+    Raises:
+        ValueError: A name is unknown; the text lists the known ones.
+    """
+    names = {name.strip() for name in text.split(",")} - {NONE}
+    unknown = sorted(names - FILES.keys())
+    if unknown:
+        raise ValueError(f"unknown output {unknown[0]!r}, expected some of {', '.join(FILES)}")
+    return tuple(name for name in FILES if name in names)
