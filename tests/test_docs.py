@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 
 from tests.core.test_layering import ABOVE, ROOMS
 from tests.support import rooms_picture
+from tests.test_commands import PARSERS
 
 ROOT = Path(__file__).resolve().parents[1]
 MOST_COLUMNS = 110
@@ -75,6 +78,34 @@ def missing_module(name: str) -> bool:
     return bool(parts) and not re.search(rf"\b{parts[0]}\b", source.read_text(encoding="utf-8"))
 
 
+def commands(text: str) -> Iterator[list[str]]:
+    """The words of every command line of this project in the code blocks and spans of a page."""
+    text = re.sub(r"\\\n\s*", " ", text)
+    lines = re.findall(r"^ {4}(dyfn-\w+ .+)$", text, flags=re.MULTILINE)
+    lines += re.findall(r"`(dyfn-\w+ [^`\n]+)`", text)
+    for line in lines:
+        yield shlex.split(line.replace("[", " ").replace("]", " "), comments=True)
+
+
+def unknown_words(words: list[str]) -> list[str]:
+    """The sub-command and the options of a command line that its parser does not offer."""
+    parser = PARSERS[words[0]]()
+    found = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            if words[1] not in action.choices and words[1] != "--version":
+                return [words[1]]
+            parser = action.choices.get(words[1], parser)
+    offered = {
+        name
+        for action in parser._actions
+        if action.help != argparse.SUPPRESS  # the old name of an option
+        for name in action.option_strings
+    }
+    found += [word for word in words if word.startswith("--") and word not in offered]
+    return found
+
+
 @every_page
 def test_lines_fit(page: Path) -> None:
     lines = page.read_text(encoding="utf-8").splitlines()
@@ -102,6 +133,13 @@ def test_named_modules_exist(page: Path) -> None:
     assert [name for name in sorted(named) if missing_module(name)] == []
 
 
+@every_current_page
+def test_commands_are_offered(page: Path) -> None:
+    lines = [w for w in commands(page.read_text(encoding="utf-8")) if w[0] in PARSERS]
+    wrong = {shlex.join(words): unknown_words(words) for words in lines}
+    assert {line: words for line, words in wrong.items() if words} == {}
+
+
 def test_checks_find_what_is_wrong(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# A `b` c\n[a](#a-b-c) [b](#no) [c](no.md) [d](https://host/no)\n")
@@ -113,6 +151,9 @@ def test_checks_find_what_is_wrong(tmp_path: Path) -> None:
         "tests/core/no.py",
         "config/*.yaml",
     ]
+    text = "    dyfn-eval run --data D \\\n        --no 1  # why\n\n`dyfn-train no` and `dyfn-x`.\n"
+    assert [unknown_words(words) for words in commands(text)] == [["--no"], ["no"]]
+    assert unknown_words(["dyfn-eval", "run", "--root", "R"]) == ["--root"]
     assert missing_module("dyfn_core.models.no")
     assert not missing_module("dyfn_core.models.load_model")
     assert not missing_module("dyfn_core.geometry.camera.pixel_intrinsics")

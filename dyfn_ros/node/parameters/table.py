@@ -60,7 +60,7 @@ class Settings(ReferenceOptions, StreamOptions):
         _NODE,
         True,
         "Frames of several cameras that wait together, of one size, run as one batch. False: one "
-        "after the other, which gives each camera the very bytes it would get alone.",
+        "after the other. On a CPU each camera's depth has the same bytes either way.",
         changes=RUN,
     )
     diagnostics_period: float = _parameter(
