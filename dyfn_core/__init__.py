@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from dyfn_core.prediction import StreamState as StreamState
     from dyfn_core.stream.depth_stream import DepthStream as DepthStream
     from dyfn_core.stream.depth_stream import push_together as push_together
+    from dyfn_core.stream.options import StreamOptions as StreamOptions
+    from dyfn_core.stream.session import StreamSession as StreamSession
 
     __version__: str
 
@@ -30,6 +32,8 @@ _HOMES = {
     "DepthStream": "dyfn_core.stream.depth_stream",
     "Frame": "dyfn_core.prediction",
     "Prediction": "dyfn_core.prediction",
+    "StreamOptions": "dyfn_core.stream.options",
+    "StreamSession": "dyfn_core.stream.session",
     "StreamState": "dyfn_core.prediction",
     "load_model": "dyfn_core.models",
     "push_together": "dyfn_core.stream.depth_stream",
@@ -41,6 +45,8 @@ __all__ = [
     "DepthStream",
     "Frame",
     "Prediction",
+    "StreamOptions",
+    "StreamSession",
     "StreamState",
     "__version__",
     "load_model",

@@ -223,7 +223,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type = StreamOptions) -> 
         shown = default if default != "" else "none"
         group.add_argument(
             flag,
-            type=_parsed(name, described, type(default)),
+            type=_parsed(described, type(default)),
             default=default,
             choices=described.choices or None,
             metavar=None if described.choices else type(default).__name__.upper(),
@@ -244,15 +244,19 @@ def options_from(
     return kind(**{name: values[name] for name in options_of(kind)})
 
 
-def _parsed(name: str, described: Option, kind: type) -> Callable[[str], Any]:
+def _parsed(described: Option, kind: type) -> Callable[[str], Any]:
+    what = {int: "a whole number", float: "a number"}.get(kind, "a text")
+    if described.range is not None:
+        low, high = described.range
+        what = f"{what} from {low:.10g} to {high:.10g}"
+
     def parse(text: str) -> Any:
         try:
             value = kind(text)
         except ValueError:
-            what = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"{text!r} is not {what}") from None
-        if described.range is not None and (problem := described.problem(name, value)):
-            raise argparse.ArgumentTypeError(problem)
+            value = None
+        if value is None or (described.range and described.problem("", value)):
+            raise argparse.ArgumentTypeError(f"expected {what}, got {text!r}")
         return value
 
     return parse

@@ -1,6 +1,6 @@
 """Messages of distance sensors -> measurements in the camera's optical frame.
 
-Reads any object with the fields of the ROS type, as messages.py does.
+Reads any object with the fields of the ROS type, as images.py does.
 """
 
 from __future__ import annotations
@@ -21,33 +21,14 @@ from dyfn_core.metric.references import (
     PointReference,
     Reference,
 )
-from dyfn_core.stream.options import SCALE, option
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.reference_options import REFERENCE_TYPES, ReferenceOptions
 
-REFERENCE_TYPES = ("Image", "PointCloud2", "LaserScan", "Range")
 ULTRASOUND = 0  # sensor_msgs/Range.radiation_type
 _FORMATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField: FLOAT32, FLOAT64
 # REP 103: a body frame (x forward, y left, z up) seen from an optical one at the same place.
 _BODY_TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-
-
-@dataclass(frozen=True)
-class ReferenceOptions:
-    """What the topic of metric_source "reference" holds; for the node and dyfn-replay."""
-
-    reference_type: str = option(
-        SCALE,
-        "PointCloud2",
-        "Type of the topic `reference`. An Image is depth registered to the camera.",
-        choices=REFERENCE_TYPES,
-    )
-    reference_transform: str = option(
-        SCALE,
-        "",
-        "Pose of the sensor in the camera's optical frame, 'x y z qx qy qz qw'. Empty: at the "
-        "camera, x forward for LaserScan and Range, optical axes for PointCloud2.",
-    )
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import uninstall_signal_handlers
 
 from dyfn_ros.node.environment import prepare_environment
+from dyfn_ros.node.parameters.declare import usage
 
 if TYPE_CHECKING:
     from dyfn_ros.node.node import ModelLoader, StreamDepthNode
@@ -21,13 +22,12 @@ if TYPE_CHECKING:
 
 def _make(args: Sequence[str] | None, load: ModelLoader | None) -> StreamDepthNode | None:
     """The node; None, and the reason on stderr, when ROS or the parameters do not allow one."""
-    # Imports that take seconds, here where `main` knows what an interrupt means.
-    from dyfn_core.models import load_model
-    from dyfn_ros.node.node import StreamDepthNode
-    from dyfn_ros.node.parameters.declare import usage
-
     try:
         usage(sys.argv if args is None else args)
+        # Imports that take seconds, here where `main` knows what an interrupt means.
+        from dyfn_core.models import load_model
+        from dyfn_ros.node.node import StreamDepthNode
+
         rclpy.init(args=None if args is None else list(args))
         return StreamDepthNode(load or load_model)
     except (ParameterException, RuntimeError) as error:  # RuntimeError: what rcl does not accept

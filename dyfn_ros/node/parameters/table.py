@@ -9,7 +9,7 @@ from typing import Any
 
 from dyfn_core.stream.options import SCALE, STREAM, StreamOptions
 from dyfn_core.threads import THREADS
-from dyfn_ros.messages.references import ReferenceOptions
+from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.node.parameters.spec import CONFIGURE, MARKS, RUN, START, Spec, spec_of
 from dyfn_ros.node.parameters.spec import parameter as _parameter
 

@@ -15,8 +15,8 @@ from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField, Range
 
 from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
 from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.messages.references import (
-    ReferenceOptions,
     decode_points,
     decode_range,
     decode_scan,

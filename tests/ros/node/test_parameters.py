@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from dyfn_core.stream.options import StreamOptions, options_of
-from dyfn_ros.messages.references import ReferenceOptions
+from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.node.parameters import docs as parameter_docs
 from dyfn_ros.node.parameters.declare import check, check_cameras, usage
 from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, Settings
