@@ -113,8 +113,8 @@ class StreamOptions:
     metric_source: str = option(
         SCALE,
         "none",
-        "Where metres come from. none: depth is relative. fixed: metric_scale. reference: "
-        "measurements on `reference`. camera_height: over the ground.",
+        "Source of metres. none: depth is relative. fixed: metric_scale. reference: measurements "
+        "on `reference`. camera_height: height over the ground.",
         choices=SOURCES,
     )
     metric_scale: float = option(
@@ -127,8 +127,8 @@ class StreamOptions:
     until_metric: str = option(
         SCALE,
         "withhold",
-        "Before a configured source has given a scale. withhold: everything is NaN. relative: "
-        "depth up to scale, so that the topic's unit changes later.",
+        "Output before a configured source has given a scale. withhold: NaN. relative: depth up "
+        "to scale; the topic's unit changes later.",
         choices=UNTIL_METRIC,
         live=True,
     )
@@ -153,7 +153,7 @@ class StreamOptions:
     calibration: str = option(
         SCALE,
         "hold",
-        "hold: the first calibration stays until the stream resets. track: follow slowly.",
+        "hold: keep the first calibration until the stream resets. track: follow slowly.",
         choices=("hold", "track"),
     )
     calibration_fit: str = option(
@@ -172,7 +172,10 @@ class StreamOptions:
         range=(2, 100_000),
     )
     tracking_rate: float = option(
-        SCALE, 0.05, "track: fastest change of the scale, a share a second.", range=(1e-4, 10.0)
+        SCALE,
+        0.05,
+        "track: fastest change of the scale, as a share per second.",
+        range=(1e-4, 10.0),
     )
     reference_disagreement: float = option(
         SCALE,

@@ -48,12 +48,14 @@ class Settings(ReferenceOptions, StreamOptions):
     )
     model: str = _parameter(_NODE, "dyfn-mini", "Bundled model's name, checkpoint file, or Hub id.")
     device: str = _parameter(
-        _NODE, "auto", "Where to run: auto (a GPU if there is one), cpu, cuda, cuda:N."
+        _NODE,
+        "auto",
+        "Device that runs the model: auto (a GPU if there is one), cpu, cuda, cuda:N.",
     )
     threads: int = _parameter(
         _NODE,
         THREADS,
-        "CPU threads for inference; depth does not depend on them; 0 leaves torch's own.",
+        "CPU threads for inference; the depth does not depend on them; 0: torch's own choice.",
         range=(0, 1024),
     )
     batch: bool = _parameter(
@@ -85,7 +87,7 @@ class Settings(ReferenceOptions, StreamOptions):
     drop_frames: bool = _parameter(
         _INPUT,
         True,
-        "Work on the latest frame and drop those that came meanwhile. False: queue and work on "
+        "Process the latest frame and drop those that came meanwhile. False: queue and process "
         "every frame in order, for recordings.",
     )
     queue_size: int = _parameter(
@@ -110,8 +112,8 @@ class Settings(ReferenceOptions, StreamOptions):
     distortion: str = _parameter(
         _INPUT,
         "undistort",
-        "When D is not 0. undistort: outputs are those of the undistorted image with the same K. "
-        "refuse: such images are errors. ignore: take K as if D were 0.",
+        "Images with D other than 0. undistort: outputs are those of the undistorted image with "
+        "the same K. refuse: such images are errors. ignore: D is taken as 0.",
         changes=RUN,
         per_camera=True,
         choices=("undistort", "refuse", "ignore"),
@@ -119,7 +121,7 @@ class Settings(ReferenceOptions, StreamOptions):
     check_frame_id: bool = _parameter(
         _INPUT,
         True,
-        "Do not use a CameraInfo whose frame_id is another than the image's.",
+        "Ignore a CameraInfo whose frame_id differs from the image's.",
         changes=RUN,
         per_camera=True,
     )
@@ -133,7 +135,7 @@ class Settings(ReferenceOptions, StreamOptions):
     depth_encoding: str = _parameter(
         _OUTPUT,
         "32FC1",
-        "Of ~/depth/image: 32FC1 with NaN where there is none, or 16UC1 in thousandths with 0.",
+        "Encoding of ~/depth/image. 32FC1: NaN where invalid. 16UC1: thousandths, 0 where invalid.",
         changes=RUN,
         per_camera=True,
         choices=("32FC1", "16UC1"),
@@ -173,7 +175,7 @@ class Settings(ReferenceOptions, StreamOptions):
     points_min_depth: float = _parameter(
         _CLOUD,
         0.0,
-        "As min_depth, for the cloud alone.",
+        "min_depth of the cloud alone.",
         changes=RUN,
         per_camera=True,
         range=(0.0, 1e6),
@@ -181,7 +183,7 @@ class Settings(ReferenceOptions, StreamOptions):
     points_max_depth: float = _parameter(
         _CLOUD,
         0.0,
-        "As max_depth, for the cloud alone.",
+        "max_depth of the cloud alone.",
         changes=RUN,
         per_camera=True,
         range=(0.0, 1e6),
