@@ -27,6 +27,16 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
     return dict(sorted((int(match.group(1)), path) for match, path in found if match))
 
 
+def hidden(path: Path) -> bool:
+    """Whether a name is no data: it begins with a dot (`.DS_Store`, `._0.png`), or `__MACOSX`."""
+    return path.name.startswith(".") or path.name == "__MACOSX"
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """The folders in a folder, sorted, without hidden ones."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not hidden(path))
+
+
 def folders_holding(root: Path, entry: str, depth: int) -> Iterator[Path]:
     """root and folders up to `depth` levels below that hold something matching the glob `entry`,
     sorted by path; a folder that does is not looked into."""
@@ -35,7 +45,7 @@ def folders_holding(root: Path, entry: str, depth: int) -> Iterator[Path]:
     if next(root.glob(entry), None) is not None:
         yield root
     elif depth > 0:
-        for path in sorted(path for path in root.iterdir() if path.is_dir()):
+        for path in subfolders(root):
             yield from folders_holding(path, entry, depth - 1)
 
 
@@ -161,7 +171,8 @@ def needed(module: str, path: Path) -> Any:
 def read_table(path: Path, columns: int) -> np.ndarray:
     """Lines of numbers -> N x columns float64. Raises FrameError naming file and expectation."""
     try:
-        return np.loadtxt(path, dtype=np.float64, ndmin=2).reshape(-1, columns)
+        table = np.loadtxt(path, dtype=np.float64, ndmin=2, encoding="utf-8-sig")
+        return table.reshape(-1, columns)
     except (OSError, ValueError) as error:
         raise FrameError(f"{path}: expected lines of {columns} numbers: {error}") from error
 

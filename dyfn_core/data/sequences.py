@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from dyfn_core.data.frames import FrameSequence
+from dyfn_core.data.frames import DataError, DataReport, FrameSequence
+from dyfn_core.data.rgbd.layouts import open_folder
+
+logger = logging.getLogger(__name__)
 
 
 def clip_frames(clip: FrameSequence, stride: int = 1) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -19,17 +22,24 @@ def clip_frames(clip: FrameSequence, stride: int = 1) -> Iterator[tuple[np.ndarr
 
 
 def folder_frames(folder: Path, stride: int = 1) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Every `stride`-th frame of a folder with rgb/N.jpg and depth/N.png (millimetres, 0 invalid).
+    """Every `stride`-th frame with depth of an RGB-D folder, in the order of time.
 
-    Raises FileNotFoundError when the folder has no frames, or naming what cannot be read.
+    Args:
+        folder: of one of the layouts of data.rgbd. What of it is not used is logged.
+        stride: of the frames that have depth.
+
+    Yields:
+        H x W x 3 uint8 RGB and H x W float32 metres, NaN invalid, both at the smaller one's size.
+
+    Raises:
+        DataError: another layout, or no frame with depth.
+        FrameError: a picture cannot be read; the message names it.
     """
-    paths = sorted((folder / "rgb").glob("*.jpg"), key=lambda path: (len(path.stem), path.stem))
-    if not paths:
-        raise FileNotFoundError(f"no rgb/*.jpg under {folder}")
-    for path in paths[::stride]:
-        depth_path = folder / "depth" / f"{path.stem}.png"
-        image = cv2.imread(str(path))
-        depth = cv2.imread(str(depth_path), cv2.IMREAD_UNCHANGED)
-        if image is None or depth is None:
-            raise FileNotFoundError(f"cannot read {path if image is None else depth_path}")
-        yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB), depth.astype(np.float32) / 1000
+    report = DataReport(str(folder))
+    opened = open_folder(folder, report)
+    report.sequences, report.frames = 1, len(opened.with_depth)
+    if not report.frames:
+        raise DataError(f"{report.summary()}: expected frames with depth")
+    if report.problems:
+        logger.warning("%s", report.summary())
+    yield from opened.pairs(stride)

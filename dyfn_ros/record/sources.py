@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dyfn_core.data.datasets import rgbd_folder as layouts
-from dyfn_core.data.frames import DataError, DataReport, FrameError, NumberedSequence
-from dyfn_core.geometry.camera import pixel_intrinsics
+from dyfn_core.data.rgbd.layouts import EXPECTED, PLAIN, FolderOptions, find_folders
 from dyfn_ros.record.camera_yaml import CameraYaml
 from dyfn_ros.recordings.errors import RecordingError
-from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_rgbd_folder
+from dyfn_ros.recordings.rgbd_folder import open_rgbd, rgbd_frames
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.typestore import Lens
 
-PLAIN_RATE, SENSOR_RATE = 10.0, 30.0  # frames a second of folders without stamps
+LEVELS = 2  # folders below the named one that are searched
 Warn = Callable[[str], None]
 
 
@@ -30,60 +27,39 @@ def folder_frames(
     intrinsics: tuple[float, float, float, float] | None = None,
     depth_scale: float | None = None,
 ) -> Iterator[FrameToRecord]:
-    """Frames of one RGB-D folder: rgb/, depth/, K.txt; TUM; 7-Scenes; a ScanNet export.
+    """Frames of one RGB-D folder of a layout of dyfn_core.data.rgbd.
 
-    Stamps: TUM's own; else the frames' numbers over `rate` a second (10 for the plain layout,
-    whose frames are counted, 30 for the others). intrinsics, depth_scale: see open_rgbd_folder;
-    depth and colour of different sizes are brought to the smaller. warn: takes what is left out.
-    Raises RecordingError: another layout, several folders (listed), a frame that cannot be read.
+    Depth and colour of different sizes are brought to the smaller one, and frames without depth
+    left out, except in the plain layout.
+
+    Args:
+        path: the folder, or one that holds one folder up to two levels below.
+        warn: takes what is left out.
+        rate: frames a second of folders without stamps; see rgbd_frames.
+        intrinsics: fx, fy, cx, cy in pixels of the colour image, instead of the folder's own.
+        depth_scale: stored depth values per metre, instead of the layout's.
+
+    Raises:
+        RecordingError: no such folder, several (listed), or one that cannot be read.
     """
-    plain = is_rgbd_folder(path) and not (path / "rgb.txt").exists()
-    if plain and intrinsics is None and depth_scale is None:
-        yield from read_rgbd_folder(path, rate or PLAIN_RATE)
-        return
-    sequence = _one_sequence(path, warn, intrinsics, depth_scale)
-    rate = rate or (PLAIN_RATE if plain else SENSOR_RATE)
-    first = sequence.numbers[0]
-    for index, number in enumerate(sequence.numbers):
-        try:
-            frame = sequence.read(index)
-        except FrameError as error:
-            warn(f"frame left out: {error}")
-            continue
-        fx, fy, cx, cy = (float(value) for value in frame.intrinsics)
-        normalised = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        matrix = pixel_intrinsics(normalised, frame.image.shape[:2])
-        stamp = (number - first) / rate if frame.stamp is None else frame.stamp
-        yield FrameToRecord(frame.image, frame.depth, matrix, frame.pose, stamp)
+    folder = open_rgbd(_one_folder(path), warn, FolderOptions(intrinsics, depth_scale))
+    sensor = folder.layout != PLAIN
+    if sensor and not folder.with_depth:
+        raise RecordingError(f"{path}: no frames with depth; expected {EXPECTED}")
+    for frame in rgbd_frames(folder, warn, rate, same_size=sensor):
+        if frame.depth_m is not None or not sensor:
+            yield frame
 
 
-def _one_sequence(
-    path: Path,
-    warn: Warn,
-    intrinsics: tuple[float, float, float, float] | None,
-    depth_scale: float | None,
-) -> NumberedSequence:
-    report = DataReport(str(path))
-    try:
-        found = layouts.open_rgbd_folder(
-            path,
-            report,
-            intrinsics=intrinsics,
-            depth_scale=depth_scale,
-            max_gap=sys.float_info.max,  # a gap is no cut here: the stamps tell of it
-            max_missing=10**9,
+def _one_folder(path: Path) -> Path:
+    found = list(find_folders(path, LEVELS))
+    if not found:
+        raise RecordingError(f"{path}: expected {EXPECTED}")
+    if len(found) > 1:
+        raise RecordingError(
+            f"{path} holds several folders, name one of them: {', '.join(map(str, found))}"
         )
-    except (DataError, FrameError) as error:
-        raise RecordingError(str(error)) from error
-    usable = [one for one in found if isinstance(one, NumberedSequence) and len(one)]
-    if not usable:
-        raise RecordingError(f"{path}: no frames with depth; expected {layouts.EXPECTED}")
-    if len(usable) > 1:
-        names = ", ".join(one.name for one in usable)
-        raise RecordingError(f"{path} holds several folders, name one of them: {names}")
-    for reason, names_of in report.problems.items():
-        warn(f"{len(names_of)} x {reason} ({names_of[0]}{', ...' if names_of[1:] else ''})")
-    return usable[0]
+    return found[0]
 
 
 def video_frames(

@@ -136,16 +136,16 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
     topic: PoseStamped or PoseWithCovarianceStamped (of the optical frame), Odometry (its child
     frame must be the camera or be tied to it by static TF), or TFMessage; None: TF when it leads
     from the camera to a root through something that moves, else the only pose or odometry topic.
-    "none" does without. An RGB-D folder has poses.txt. Raises PoseError: no poses, several
+    "none" does without. An RGB-D folder has its own. Raises PoseError: no poses, several
     candidates (listed), a topic that is absent or of another type.
     """
     if topic == NONE:
         raise PoseError("poses were not wanted")
     if path.is_dir() and is_rgbd_folder(path):
         poses = read_poses(path)
-        if poses is None:
-            raise PoseError(f"{path} holds no poses.txt")
-        return lambda index, stamp_ns: poses[index] if index < len(poses) else None
+        if not poses:
+            raise PoseError(f"{path} holds no poses.txt or groundtruth.txt of its frames")
+        return lambda index, stamp_ns: poses.get(stamp_ns)
     storage = open_storage(path)
     kinds = {name: t.kind for name, t in storage.topics.items() if t.kind in POSE_KINDS and t.count}
     tree = _read_tree(storage, kinds)

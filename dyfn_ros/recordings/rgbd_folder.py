@@ -1,137 +1,176 @@
-"""An RGB-D folder (rgb/, depth/, K.txt, poses.txt) read as a sequence of frames."""
+"""An RGB-D folder read as a recording."""
 
 from __future__ import annotations
 
-import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
+from dyfn_core.data.files import registered
+from dyfn_core.data.frames import DataError, DataReport, FrameError
+from dyfn_core.data.rgbd.cameras import FolderCamera
+from dyfn_core.data.rgbd.folder import FrameFiles, RgbdFolder
+from dyfn_core.data.rgbd.layouts import PLAIN, FolderOptions, layout_of, open_folder
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
-from dyfn_ros.recordings.rgbd_writer import FrameToRecord
+from dyfn_ros.recordings.rgbd_writer import FrameToRecord, in_nanoseconds
 from dyfn_ros.recordings.storage.base import Recorded
 from dyfn_ros.recordings.topics import Topics
 from dyfn_ros.recordings.typestore import CAMERA_INFO, IMAGE, TYPES, camera_info, image_message
 
-IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png"}
+PLAIN_RATE, SENSOR_RATE = 10.0, 30.0  # frames a second of folders without stamps
+Lose = Callable[[str], None]
 
 
 def is_rgbd_folder(path: Path) -> bool:
-    """Whether the folder holds rgb/ and no recording."""
-    return (path / "rgb").is_dir() and not (path / "metadata.yaml").exists()
+    """Whether the folder has a layout of RGB-D folders and is no rosbag2 folder."""
+    return layout_of(path) is not None and not (path / "metadata.yaml").exists()
 
 
-def numbered(folder: Path, suffixes: set[str]) -> list[Path]:
-    """Image files of a folder in numeric order of their names (9 before 10)."""
-    files = (f for f in folder.iterdir() if f.suffix.lower() in suffixes)
-    return sorted(files, key=lambda f: ([int(n) for n in re.findall(r"\d+", f.stem)], f.name))
+def open_rgbd(path: Path, warn: Lose, options: FolderOptions | None = None) -> RgbdFolder:
+    """Find the frames of an RGB-D folder.
 
+    Args:
+        path: of a layout of dyfn_core.data.rgbd.
+        warn: takes what is not used, a line for each reason.
+        options: instead of what the folder says.
 
-def read_rgbd_folder(
-    path: str | Path, rate: float = 10.0, lose: Callable[[str], None] | None = None
-) -> Iterator[FrameToRecord]:
-    """Frames of `rgb/*.jpg|png` with `depth/<same name>.png`, stamped 0, 1/rate, 2/rate ...
-
-    depth: uint16 millimetres, 0 = none. `K.txt`: 3 x 3 intrinsics in pixels. `poses.txt`: a
-    row-major 4 x 4 camera-to-world matrix a line, one per colour frame. All three are optional.
-    lose: takes what is wrong with a picture, which is then left out; the stamps stay.
-    Raises RecordingError naming the file that is missing, unreadable or of the wrong shape.
+    Raises:
+        RecordingError: another layout, a file of text that cannot be read, or intrinsics that
+            cannot be of these images.
     """
-    folder = Path(path)
-    files = numbered(folder / "rgb", IMAGE_SUFFIXES) if (folder / "rgb").is_dir() else []
-    if not files:
-        raise RecordingError(f"{folder}: expected colour images (jpg or png) in {folder / 'rgb'}")
-    camera_matrix = _matrix(folder / "K.txt", (3, 3))
-    poses = _matrix(folder / "poses.txt", (len(files), 4, 4))
-    for index, file in enumerate(files):
-        image = _attempt(_colour, file, lose)
+    report = DataReport(str(path))
+    try:
+        folder = open_folder(path, report, options)
+        folder.check_camera()
+    except DataError as error:
+        raise RecordingError(str(error)) from error
+    for reason, names in report.problems.items():
+        warn(f"{len(names)} x {reason} ({names[0]}{', ...' if names[1:] else ''})")
+    return folder
+
+
+def rgbd_frames(
+    folder: RgbdFolder, lose: Lose, rate: float | None = None, same_size: bool = False
+) -> Iterator[FrameToRecord]:
+    """The frames of an RGB-D folder, in the order of time, those without depth as well.
+
+    Args:
+        folder: as open_rgbd gives it.
+        lose: takes what is wrong with a picture, which is then left out; the stamps stay.
+        rate: frames a second where the folder has no stamps; None: 10 for the plain layout, whose
+            frames are counted, 30 for the others, whose numbers are.
+        same_size: bring colour and depth of different sizes to the smaller one.
+    """
+    for files, stamp in zip(folder.frames, _stamps(folder, rate), strict=True):
+        image = _attempt(folder.image, files, lose)
         if image is None:
             continue
+        depth = _attempt(folder.depth, files, lose)
+        camera = _camera(folder, image, lose)
+        if same_size and depth is not None and files.depth is not None:
+            try:
+                image, depth, camera = _same_size(image, depth, camera, files.depth)
+            except FrameError as error:
+                lose(str(error))
+                depth = None
         yield FrameToRecord(
             image=image,
-            depth_m=_attempt(_depth, folder / "depth" / f"{file.stem}.png", lose),
-            camera_matrix=camera_matrix,
-            pose=None if poses is None else poses[index],
-            stamp=index / rate,
+            depth_m=depth,
+            camera_matrix=None if camera is None else _matrix(camera),
+            pose=files.pose,
+            stamp=stamp,
         )
 
 
-def read_poses(folder: Path) -> np.ndarray | None:
-    """N x 4 x 4 camera to world, one per colour frame; None without `poses.txt`.
+def _stamps(folder: RgbdFolder, rate: float | None = None) -> list[float]:
+    """Seconds of every frame; see rgbd_frames."""
+    counted = folder.layout == PLAIN
+    rate = rate or (PLAIN_RATE if counted else SENSOR_RATE)
+    first = folder.frames[0].number
+    return [
+        (index if counted else files.number - first) / rate if files.stamp is None else files.stamp
+        for index, files in enumerate(folder.frames)
+    ]
 
-    Raises RecordingError when it has another number of rows than there are colour images.
+
+def read_poses(path: Path) -> dict[int, np.ndarray]:
+    """4 x 4 camera to world by the frames' stamps in nanoseconds, where it is known.
+
+    Raises RecordingError as open_rgbd does.
     """
-    return _matrix(folder / "poses.txt", (len(numbered(folder / "rgb", IMAGE_SUFFIXES)), 4, 4))
+    folder = open_rgbd(path, warn=lambda reason: None)
+    stamps = map(in_nanoseconds, _stamps(folder))
+    placed = zip(stamps, folder.frames, strict=True)
+    return {stamp: files.pose for stamp, files in placed if files.pose is not None}
 
 
 def _attempt(
-    read: Callable[[Path], np.ndarray | None], file: Path, lose: Callable[[str], None] | None
+    read: Callable[[FrameFiles], np.ndarray | None], files: FrameFiles, lose: Lose
 ) -> np.ndarray | None:
     try:
-        return read(file)
-    except RecordingError as error:
-        if lose is None:
-            raise
+        return read(files)
+    except FrameError as error:
         lose(str(error))
         return None
 
 
-def _matrix(file: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    if not file.exists():
+def _camera(folder: RgbdFolder, image: np.ndarray, lose: Lose) -> FolderCamera | None:
+    """The intrinsics of an image of this size."""
+    if folder.camera is None:
         return None
+    size = (image.shape[0], image.shape[1])
     try:
-        return np.loadtxt(file, dtype=np.float64).reshape(shape)
-    except ValueError as error:
-        raise RecordingError(f"{file}: expected numbers of shape {shape}: {error}") from error
-
-
-def _colour(file: Path) -> np.ndarray:
-    pixels = cv2.imread(str(file), cv2.IMREAD_COLOR)
-    if pixels is None:
-        raise RecordingError(f"{file}: expected a colour image, cannot decode it")
-    return np.ascontiguousarray(pixels[..., ::-1])
-
-
-def _depth(file: Path) -> np.ndarray | None:
-    if not file.exists():
+        return FolderCamera(folder.camera.at(size), folder.camera.source, size)
+    except FrameError as error:
+        lose(str(error))
         return None
-    pixels = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 2:
-        found = "an unreadable file" if pixels is None else f"{pixels.dtype} {pixels.shape}"
-        raise RecordingError(f"{file}: expected a 16-bit one-channel PNG in mm, found {found}")
-    metres = pixels.astype(np.float32) / 1000
-    return np.where(pixels > 0, metres, np.float32(np.nan))
+
+
+def _same_size(
+    image: np.ndarray, depth: np.ndarray, camera: FolderCamera | None, path: Path
+) -> tuple[np.ndarray, np.ndarray, FolderCamera | None]:
+    image, depth = registered(image, depth, path)
+    size = (image.shape[0], image.shape[1])
+    if camera is not None:
+        camera = FolderCamera(camera.at(size), camera.source, size)
+    return image, depth, camera
+
+
+def _matrix(camera: FolderCamera) -> np.ndarray:
+    fx, fy, cx, cy = camera.pixels
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 class RgbdRecording:
-    """Frames of an RGB-D folder, as if they had been recorded at a fixed rate."""
+    """Frames of an RGB-D folder, as if they had been recorded."""
 
     topics = Topics("rgb/", "K.txt", "depth/")
 
-    def __init__(self, path: Path, rate: float = 10.0) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self.notes = Notes()
-        self._rate = rate
+        self._warnings: Counter[str] = Counter()
+        self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]))
+        self.notes = Notes(warnings=self._warnings.copy())
 
     @property
     def expected_frames(self) -> int:
         """See Recording."""
-        return len(numbered(self.path / "rgb", IMAGE_SUFFIXES))
+        return len(self._folder.frames)
 
     def frames(self) -> Iterator[RecordedFrame]:
         """See Recording."""
         frame_id = "camera_optical"
-        self.notes = Notes()
+        self.notes = Notes(warnings=self._warnings.copy())
 
         def lose(reason: str) -> None:
             self.notes.losses[reason] += 1
 
-        for index, frame in enumerate(read_rgbd_folder(self.path, self._rate, lose)):
-            stamp_ns = round(frame.stamp * 1e9)
+        for index, frame in enumerate(rgbd_frames(self._folder, lose)):
+            stamp_ns = frame.stamp_ns
             image = image_message(frame.image, "rgb8", stamp_ns, frame_id)
             info = None
             if frame.camera_matrix is not None:

@@ -37,10 +37,13 @@ class FrameToRecord:
 
     @property
     def stamp_ns(self) -> int:
-        """Nanoseconds; of seconds since 1970, whose floats are no finer, to the microsecond."""
-        if abs(self.stamp) < 1e6:
-            return round(self.stamp * 1e9)
-        return round(self.stamp * 1e6) * 1000
+        """See in_nanoseconds."""
+        return in_nanoseconds(self.stamp)
+
+
+def in_nanoseconds(seconds: float) -> int:
+    """Of seconds since 1970, whose floats are no finer, to the microsecond."""
+    return round(seconds * 1e9) if abs(seconds) < 1e6 else round(seconds * 1e6) * 1000
 
 
 def write_rgbd_recording(

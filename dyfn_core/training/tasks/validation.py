@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dyfn_core.data.frames import FrameError, FrameSequence
+from dyfn_core.data.sequences import folder_frames
 from dyfn_core.models.base import GeometryModel, image_to_batch
 from dyfn_core.scoring.protocols import SequenceScorer
 
@@ -48,20 +49,8 @@ def spread_examples(sequences: list[FrameSequence], count: int) -> list[Example]
 
 
 def recording_examples(folder: Path, every: int = 20) -> list[Example]:
-    """Every so-many-th frame of a folder with rgb/NNNNN.jpg and depth/NNNNN.png (millimetres).
-
-    Raises FileNotFoundError when it holds none.
-    """
-    examples = []
-    for path in sorted((folder / "rgb").glob("*.jpg"))[::every]:
-        image = cv2.imread(str(path))
-        depth = cv2.imread(str(folder / "depth" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
-        if image is None or depth is None:
-            raise FileNotFoundError(f"{path} or its depth image cannot be read")
-        examples.append(_small(image[..., ::-1], depth.astype(np.float32) / 1000))
-    if not examples:
-        raise FileNotFoundError(f"no rgb/*.jpg under {folder}")
-    return examples
+    """Every N-th frame with depth of an RGB-D folder, in the order of time; see folder_frames."""
+    return [_small(image, depth) for image, depth in folder_frames(folder, every)]
 
 
 def _small(image: np.ndarray, depth: np.ndarray) -> Example:

@@ -170,7 +170,7 @@ def test_bonn_takes_frames_30_to_139_and_no_pose(tmp_path: Path) -> None:
     for number, frame in zip(sequence.numbers, sequence.frames(), strict=True):
         check(frame, number, TUM_SIZE, 1 / 5000)
         assert frame.pose is None and frame.camera_matrix is not None
-        assert frame.camera_matrix[0, 0] == pytest.approx(542.822841, rel=1e-6)
+        assert frame.camera_matrix[0, 0] == pytest.approx(542.822841 / 20, rel=1e-6)
 
 
 def test_tum_depth_is_matched_by_stamp_and_not_by_order(tmp_path: Path) -> None:
@@ -181,7 +181,7 @@ def test_tum_depth_is_matched_by_stamp_and_not_by_order(tmp_path: Path) -> None:
         check(frame, number, TUM_SIZE, 1 / 5000)
         assert frame.pose is not None and frame.camera_matrix is not None
         np.testing.assert_allclose(frame.pose, pose(number), atol=1e-12)
-        assert frame.camera_matrix[0, 0] == pytest.approx(535.4, rel=1e-6)
+        assert frame.camera_matrix[0, 0] == pytest.approx(535.4 / 20, rel=1e-6)
 
 
 def test_seven_scenes_test_sequences(tmp_path: Path) -> None:

@@ -50,6 +50,13 @@ def plain(folder: Path) -> tuple[list[int], np.ndarray]:
     return [0, 100_000_000, 200_000_000], matrix
 
 
+def of_640_x_480(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+    """Published intrinsics at the size of these images, which is a twentieth."""
+    return np.array(
+        [[fx / 20, 0, (cx + 0.5) / 20 - 0.5], [0, fy / 20, (cy + 0.5) / 20 - 0.5], [0, 0, 1]]
+    )
+
+
 def tum(folder: Path) -> tuple[list[int], np.ndarray]:
     rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i, stamp in enumerate(STEREO_STAMPS):
@@ -62,7 +69,7 @@ def tum(folder: Path) -> tuple[list[int], np.ndarray]:
     for kind, lines in rows.items():
         (folder / f"{kind}.txt").write_text("\n".join(["# a comment", *lines]))
     stamps = [int(text.replace(".", "")) * 1000 for text in STEREO_STAMPS]
-    return stamps, np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+    return stamps, of_640_x_480(517.3, 516.5, 318.6, 255.3)
 
 
 def seven_scenes(folder: Path) -> tuple[list[int], np.ndarray]:
@@ -72,7 +79,7 @@ def seven_scenes(folder: Path) -> tuple[list[int], np.ndarray]:
         save(base.with_name(f"{base.name}.depth.png"), millimetres(i))
         np.savetxt(base.with_name(f"{base.name}.pose.txt"), pose(i))
     stamps = [0, 33_333_333, 100_000_000]
-    return stamps, np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])
+    return stamps, of_640_x_480(585, 585, 320, 240)
 
 
 def scannet(folder: Path) -> tuple[list[int], np.ndarray]:

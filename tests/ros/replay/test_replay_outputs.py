@@ -311,4 +311,7 @@ def test_an_rgbd_folder_has_its_poses(tmp_path: Path) -> None:
     with pytest.raises(PoseError, match=r"holds no poses\.txt"):
         open_poses(tmp_path, "camera_optical")
     np.savetxt(tmp_path / "poses.txt", [camera_pose(i).ravel() for i in range(3)])
-    np.testing.assert_allclose(open_poses(tmp_path, "camera_optical")(2, 0), camera_pose(2))  # type: ignore[arg-type]
+    where = open_poses(tmp_path, "camera_optical")
+    np.testing.assert_allclose(where(2, 200_000_000), camera_pose(2))  # type: ignore[arg-type]
+    # The stamp tells the frame: its index is another one when a picture was lost before it.
+    np.testing.assert_allclose(where(0, 100_000_000), camera_pose(1))  # type: ignore[arg-type]

@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from dyfn_core.data.datasets.rgbd_folder import TUM_CAMERAS
 from dyfn_core.data.frames import DataReport
+from dyfn_core.data.rgbd.layouts import TUM
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source
 from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
@@ -30,9 +30,7 @@ def open_bonn(root: Path, report: DataReport) -> list[Source]:
     groundtruth.txt needs the calibration of the markers, which is not in the folders: no poses
     are taken.
     """
-    sources = rgbd_sources(
-        root, "rgb.txt", report, named=lambda folder: folder.name, intrinsics=TUM_CAMERAS["bonn"]
-    )
+    sources = rgbd_sources(root, (TUM,), report, named=lambda folder: folder.name)
     return [replace(source, read=partial(_without_pose, source)) for source in sources]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
+from dyfn_core.data.rgbd.layouts import SCANNET
 from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
 from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
@@ -20,4 +21,4 @@ LENGTHS = dict.fromkeys(SCENES, 90)
 
 def open_scannet(root: Path, report: DataReport) -> list[Source]:
     """uint16 millimetres, 0 invalid; colour 1296 x 968 is resized to the depth's 640 x 480."""
-    return rgbd_sources(root, "color", report, named=lambda folder: folder.name)
+    return rgbd_sources(root, (SCANNET,), report, named=lambda folder: folder.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
+from dyfn_core.data.rgbd.layouts import SEVEN_SCENES
 from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
 from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
@@ -28,7 +29,7 @@ def open_seven_scenes(root: Path, report: DataReport) -> list[Source]:
     """uint16 millimetres, 0 and 65535 invalid; 585, 585, 320, 240 as intrinsics."""
     return rgbd_sources(
         root,
-        "frame-*.color.*",
+        (SEVEN_SCENES,),
         report,
         named=lambda folder: f"{folder.parent.name}/{folder.name}",
     )

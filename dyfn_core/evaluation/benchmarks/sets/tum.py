@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
+from dyfn_core.data.rgbd.layouts import TUM
 from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
 from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
@@ -17,4 +18,4 @@ SETTINGS = Settings(depth_max=10)
 
 def open_tum(root: Path, report: DataReport) -> list[Source]:
     """uint16, 5000 a metre, 0 invalid; the published intrinsics of freiburg1, 2 and 3."""
-    return rgbd_sources(root, "rgb.txt", report, named=lambda folder: folder.name)
+    return rgbd_sources(root, (TUM,), report, named=lambda folder: folder.name)

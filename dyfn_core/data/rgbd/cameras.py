@@ -1,0 +1,115 @@
+"""Intrinsics of RGB-D folders: K.txt, published calibrations, and whether they fit an image."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dyfn_core.data.files import SAME_ASPECT
+from dyfn_core.data.frames import DataError, FrameError
+
+Camera = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels, the first pixel's centre 0
+Size = tuple[int, int]  # rows, columns
+FOCAL_RANGE = (0.1, 10.0)  # focal lengths in units of the image's width that are believed
+SKEW = 1e-3  # relative to fx; more is refused
+EXPECTED = "a 3 x 3 (or 4 x 4) camera matrix [fx 0 cx; 0 fy cy; 0 0 1], or fx fy cx cy, in pixels"
+# The published calibrations of cameras whose folders come without one, of 640 x 480 pixels.
+TUM_CAMERAS: dict[str, Camera] = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+    "bonn": (542.822841, 542.576870, 315.593520, 237.756098),
+}
+SEVEN_SCENES_CAMERA: Camera = (585.0, 585.0, 320.0, 240.0)
+PUBLISHED_SIZE: Size = (480, 640)
+
+
+@dataclass(frozen=True)
+class FolderCamera:
+    """Intrinsics of one folder.
+
+    Attributes:
+        pixels: fx, fy, cx, cy.
+        source: where they are from, for messages.
+        size: of the images that they were measured on; None when they are of these images.
+    """
+
+    pixels: Camera
+    source: str
+    size: Size | None = None
+
+    def at(self, size: Size) -> Camera:
+        """Intrinsics for images of this size.
+
+        Raises:
+            FrameError: they are of images of another shape, or cannot be of these images: the
+                principal point outside, or a focal length that is no tenth to ten times the width.
+        """
+        (height, width), (fx, fy, cx, cy) = size, self.pixels
+        if self.size is not None and self.size != size:
+            rows, columns = self.size
+            if abs(width * rows / (height * columns) - 1) > SAME_ASPECT:
+                raise FrameError(
+                    f"{self.source}: of {columns} x {rows} pixels, but the images have {width} x "
+                    f"{height}"
+                )
+            x, y = width / columns, height / rows
+            fx, fy, cx, cy = fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5
+        inside = -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5
+        low, high = (width * factor for factor in FOCAL_RANGE)
+        if not (inside and low <= min(fx, fy) and max(fx, fy) <= high):
+            raise FrameError(
+                f"{self.source}: fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot be intrinsics in "
+                f"pixels of images of {width} x {height}: expected the principal point inside and "
+                f"focal lengths of {low:g} to {high:g}"
+            )
+        return fx, fy, cx, cy
+
+
+def published_camera(folder: Path) -> FolderCamera | None:
+    """Of a TUM or Bonn sequence, by its path; None when the path names none."""
+    named = str(folder.resolve()).lower()
+    known = [name for name in TUM_CAMERAS if name in named]
+    if not known:
+        return None
+    source = f"published intrinsics of {known[-1]}"
+    return FolderCamera(TUM_CAMERAS[known[-1]], source, PUBLISHED_SIZE)
+
+
+def read_camera(path: Path) -> FolderCamera:
+    """A camera matrix out of a text file.
+
+    Raises:
+        DataError: the file holds something else, or a matrix that no camera has.
+    """
+    try:
+        lines = (line.split("#")[0] for line in path.read_text("utf-8-sig").splitlines())
+        words = (word for line in lines for word in re.split(r"[\s,;\[\]]+", line) if word)
+        values = [float(word) for word in words]
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: expected {EXPECTED}: {error}") from error
+    shapes = {9: (3, 3), 16: (4, 4)}
+    if len(values) == 4:
+        fx, fy, cx, cy = values
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    elif len(values) in shapes:
+        matrix = np.array(values).reshape(shapes[len(values)])[:3, :3]
+    else:
+        raise DataError(f"{path}: expected {EXPECTED}, got {len(values)} numbers")
+    return FolderCamera(_checked(matrix, path), str(path))
+
+
+def _checked(matrix: np.ndarray, path: Path) -> Camera:
+    told = f"got {matrix.tolist()}"
+    fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
+    if not np.isfinite(matrix).all() or not (fx > 0 and fy > 0):
+        raise DataError(f"{path}: expected finite numbers and focal lengths above 0, {told}")
+    if not np.array_equal(matrix[2], [0, 0, 1]):
+        turned = " (it is transposed)" if np.array_equal(matrix[:, 2], [0, 0, 1]) else ""
+        raise DataError(f"{path}: expected the last row 0 0 1{turned}, {told}")
+    if max(abs(matrix[0, 1]), abs(matrix[1, 0])) > SKEW * fx:
+        raise DataError(f"{path}: expected a camera matrix without skew, {told}")
+    return fx, fy, float(matrix[0, 2]), float(matrix[1, 2])

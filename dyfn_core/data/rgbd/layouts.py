@@ -1,0 +1,290 @@
+"""The layouts of RGB-D folders, and how the frames of each are found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from dyfn_core.data.files import numbered_files, read_table, subfolders, usable_poses
+from dyfn_core.data.frames import DataError, DataReport, FrameError
+from dyfn_core.data.rgbd.cameras import (
+    PUBLISHED_SIZE,
+    SEVEN_SCENES_CAMERA,
+    Camera,
+    FolderCamera,
+    published_camera,
+)
+from dyfn_core.data.rgbd.folder import Calibration, FrameFiles, RgbdFolder
+from dyfn_core.data.rgbd.lists import associated_files, nearest, stamped_files, trajectory
+from dyfn_core.data.rgbd.names import FIRST_TIME, frame_numbers, paired, visible_files
+
+LAYOUTS = TUM, ASSOCIATIONS, SEVEN_SCENES, SCANNET, PLAIN = (
+    "tum",
+    "associations",
+    "7scenes",
+    "scannet",
+    "plain",
+)
+EXPECTED = (
+    "one of: rgb.txt and depth.txt (TUM); associations.txt; frame-000000.color.png, .depth.png, "
+    ".pose.txt (7-Scenes); color/, depth/, pose/, intrinsic/ (ScanNet export); rgb/, depth/, K.txt"
+)
+ASSOCIATION_FILES = ("associations.txt", "associate.txt", "association.txt", "assoc.txt")
+COLOUR_SUFFIXES, DEPTH_SUFFIXES = (".jpg", ".jpeg", ".png"), (".png",)
+TEXT_SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".db", ".ini")
+MILLIMETRES, TUM_UNIT = 1000.0, 5000.0  # stored depth values per metre
+TOLERANCE = 0.02  # seconds between a colour frame and its depth or pose
+GROUND_TRUTH = "groundtruth.txt"
+Poses = Mapping[Path, np.ndarray]  # by colour file
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """What a user may give instead of what a folder says.
+
+    Attributes:
+        intrinsics: fx, fy, cx, cy in pixels of the colour image.
+        depth_scale: stored depth values per metre.
+        tolerance: seconds between a colour frame and its depth, in folders with stamps.
+    """
+
+    intrinsics: Camera | None = None
+    depth_scale: float | None = None
+    tolerance: float = TOLERANCE
+
+    def calibration(self, file: Path, published: FolderCamera | None = None) -> Calibration:
+        """Of a folder whose own is in this file."""
+        given = None if self.intrinsics is None else FolderCamera(self.intrinsics, "intrinsics")
+        return Calibration(given, file, published)
+
+
+def layout_of(folder: Path) -> str | None:
+    """One of LAYOUTS; None for a folder of another kind."""
+    if not folder.is_dir():
+        return None
+    if (folder / "rgb.txt").is_file():
+        return TUM
+    if _association_file(folder) is not None:
+        return ASSOCIATIONS
+    if next(folder.glob("frame-*.color.*"), None) is not None:
+        return SEVEN_SCENES
+    if (folder / "color").is_dir() and (
+        (folder / "depth").is_dir() or (folder / "intrinsic").is_dir()
+    ):
+        return SCANNET
+    return PLAIN if (folder / "rgb").is_dir() else None
+
+
+def find_folders(root: Path, levels: int) -> Iterator[Path]:
+    """root and folders up to `levels` below it that have a layout, sorted by path; a folder that
+    does is not looked into."""
+    if not root.is_dir():
+        return
+    if layout_of(root) is not None:
+        yield root
+    elif levels > 0:
+        for folder in subfolders(root):
+            yield from find_folders(folder, levels - 1)
+
+
+def open_folder(path: Path, report: DataReport, options: FolderOptions | None = None) -> RgbdFolder:
+    """Find the frames of one folder; no picture is read.
+
+    Args:
+        path: of one of LAYOUTS.
+        report: counts what is not paired or cannot be used.
+        options: instead of what the folder says.
+
+    Raises:
+        DataError: the folder has no known layout or no colour image, or one of its text files is
+            unreadable.
+    """
+    layout = layout_of(path)
+    if layout is None:
+        raise DataError(f"{path}: expected {EXPECTED}")
+    try:
+        opened = _OPENERS[layout](path, report, options or FolderOptions())
+    except FrameError as error:
+        raise DataError(str(error)) from error
+    if not opened.frames:
+        raise DataError(f"{path}: expected colour images (jpg or png) and found none")
+    return opened
+
+
+def _plain(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
+    images = _files(folder / "rgb", COLOUR_SUFFIXES, report)
+    poses: Poses = {}
+    table = folder / "poses.txt"
+    if table.exists():
+        rows = usable_poses(read_table(table, 16), table, report).reshape(-1, 4, 4)
+        if len(rows) != len(images):
+            raise DataError(f"{table}: {len(rows)} poses for {len(images)} images")
+        poses = {image: row for image, row in zip(images, rows, strict=True) if _finite(row)}
+    frames = _in_folders(folder, images, poses, report)
+    calibration = options.calibration(folder / "K.txt")
+    return RgbdFolder(folder, PLAIN, frames, calibration, options.depth_scale or MILLIMETRES)
+
+
+def _scannet(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
+    images = _files(folder / "color", COLOUR_SUFFIXES, report)
+    texts = [path for path in visible_files(folder / "pose") if path.suffix == ".txt"]
+    frames = _in_folders(folder, images, _pose_files(paired(images, texts), report), report)
+    calibration = options.calibration(folder / "intrinsic" / "intrinsic_color.txt")
+    return RgbdFolder(folder, SCANNET, frames, calibration, options.depth_scale or MILLIMETRES)
+
+
+def _seven_scenes(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
+    images = numbered_files(folder, r"frame-(\d+)\.color\.(?:png|jpg)")
+    depths = numbered_files(folder, r"frame-(\d+)\.depth\.png")
+    texts = numbered_files(folder, r"frame-(\d+)\.pose\.txt")
+    poses = _pose_files({images[n]: texts[n] for n in images if n in texts}, report)
+    pairs = {images[n]: depths[n] for n in images if n in depths}
+    _count_lone(list(images.values()), list(depths.values()), pairs, report)
+    frames = tuple(
+        FrameFiles(number, image, pairs.get(image), poses.get(image))
+        for number, image in images.items()
+    )
+    source = "published intrinsics of 7-Scenes"
+    published = FolderCamera(SEVEN_SCENES_CAMERA, source, PUBLISHED_SIZE)
+    calibration = options.calibration(folder / "K.txt", published)
+    unit = options.depth_scale or MILLIMETRES
+    return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,))
+
+
+def _tum(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
+    colours = stamped_files(folder / "rgb.txt", report)
+    has_depth = (folder / "depth.txt").exists() or (folder / "depth").exists()
+    depths = stamped_files(folder / "depth.txt", report) if has_depth else []
+    files = []
+    for number, (stamp, image) in enumerate(colours):
+        depth = nearest(depths, stamp, options.tolerance)
+        if depth is None and has_depth:
+            report.miss(f"image without depth within {options.tolerance} s", image)
+        files.append(FrameFiles(number, image, depth, stamp=stamp))
+    if not (folder / GROUND_TRUTH).exists():
+        report.miss(f"folder without {GROUND_TRUTH} (its frames have no poses)", folder)
+    return _listed(folder, TUM, files, report, options)
+
+
+def _associations(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
+    table = _association_file(folder)
+    assert table is not None, "layout_of has found it"
+    entries = associated_files(table, report)
+    stamps = [stamp for stamp, _, _ in entries]
+    counted = all(stamp % 1 == 0 and stamp < FIRST_TIME for stamp in stamps)
+    rising = all(a < b for a, b in pairwise(stamps))
+    files = [
+        FrameFiles(int(stamp), image, depth)
+        if counted and rising
+        else FrameFiles(number, image, depth, stamp=stamp)
+        for number, (stamp, image, depth) in enumerate(entries)
+    ]
+    named = {path for _, *paths in entries for path in paths}
+    for place in sorted({image.parent for _, image, _ in entries}):
+        for path in visible_files(place):
+            if path.suffix.lower() in COLOUR_SUFFIXES and path not in named:
+                report.miss(f"picture that {table.name} does not name", path)
+    return _listed(folder, ASSOCIATIONS, files, report, options)
+
+
+def _listed(
+    folder: Path,
+    layout: str,
+    files: Sequence[FrameFiles],
+    report: DataReport,
+    options: FolderOptions,
+) -> RgbdFolder:
+    """A folder whose files are in lists: poses by stamp, TUM's unit and calibrations."""
+    if (folder / GROUND_TRUTH).exists():
+        poses = trajectory(folder / GROUND_TRUTH, report)
+        files = [_placed(frame, poses, options.tolerance) for frame in files]
+    calibration = options.calibration(folder / "K.txt", published_camera(folder))
+    unit = options.depth_scale or TUM_UNIT
+    return RgbdFolder(folder, layout, tuple(files), calibration, unit)
+
+
+def _placed(
+    frame: FrameFiles, poses: list[tuple[float, np.ndarray]], tolerance: float
+) -> FrameFiles:
+    if frame.stamp is None:
+        return frame
+    return replace(frame, pose=nearest(poses, frame.stamp, tolerance))
+
+
+def _association_file(folder: Path) -> Path | None:
+    found = (folder / name for name in ASSOCIATION_FILES)
+    return next((path for path in found if path.is_file()), None)
+
+
+def _files(folder: Path, suffixes: tuple[str, ...], report: DataReport) -> list[Path]:
+    """Pictures of these types in numeric order; files of other types that may be meant are
+    counted."""
+    found = []
+    for path in visible_files(folder):
+        suffix = path.suffix.lower()
+        if suffix in suffixes:
+            found.append(path)
+        elif path.is_file() and suffix not in TEXT_SUFFIXES:
+            expected = ", ".join(suffixes)
+            report.miss(f"{suffix} file in {folder.name}/ that is not read ({expected} are)", path)
+    return found
+
+
+def _in_folders(
+    folder: Path, images: list[Path], poses: Poses, report: DataReport
+) -> tuple[FrameFiles, ...]:
+    """The frames of these colour files, with depth/*.png that belong to them by name."""
+    depths = _files(folder / "depth", DEPTH_SUFFIXES, report)
+    pairs = paired(images, depths)
+    if (folder / "depth").is_dir():
+        _count_lone(images, depths, pairs, report)
+    return tuple(
+        FrameFiles(number, image, pairs.get(image), poses.get(image))
+        for number, image in zip(frame_numbers(images), images, strict=True)
+    )
+
+
+def _count_lone(
+    images: list[Path], depths: list[Path], pairs: Mapping[Path, Path], report: DataReport
+) -> None:
+    """Count what has no partner."""
+    used = set(pairs.values())
+    for image in images:
+        if image not in pairs:
+            report.miss("image without depth", image)
+    for depth in depths:
+        if depth not in used:
+            report.miss("depth without image", depth)
+
+
+def _pose_files(texts: Mapping[Path, Path], report: DataReport) -> dict[Path, np.ndarray]:
+    """4 x 4 camera to world of each colour file; those that cannot be used are counted."""
+    poses = {}
+    for image, path in texts.items():
+        try:
+            pose = read_table(path, 16).reshape(4, 4)
+        except (FrameError, ValueError) as error:
+            report.miss(f"pose that cannot be read: {error}", path)
+            continue
+        if _finite(pose):
+            poses[image] = pose
+        else:
+            report.miss("pose that is not finite (the frame stays)", path)
+    return poses
+
+
+def _finite(pose: np.ndarray) -> bool:
+    return bool(np.isfinite(pose).all())
+
+
+_OPENERS: dict[str, Callable[[Path, DataReport, FolderOptions], RgbdFolder]] = {
+    TUM: _tum,
+    ASSOCIATIONS: _associations,
+    SEVEN_SCENES: _seven_scenes,
+    SCANNET: _scannet,
+    PLAIN: _plain,
+}
