@@ -1,19 +1,29 @@
 """Streaming monocular geometry: frames of one camera in, point maps that keep one scale out.
 
+Models: `load_model`, `save_model`. One camera over time: `DepthStream` (geometry up to scale), and
+`StreamSession` with `StreamOptions`, which adds what the ROS 2 node does: scene cuts, metric scale
+from a `PointReference`, `DepthReference` or `ConeReference`, saved state. Several cameras in one
+batch: `push_together`. Values: `Frame` goes in, `Prediction` comes out, `StreamState` is DyFN's
+memory in between.
+
+Example:
     >>> import numpy as np
     >>> from dyfn_core import DepthStream, load_model
-    >>> stream = DepthStream(load_model("dyfn-mini"))
-    >>> prediction = stream.push(np.zeros((48, 64, 3), np.uint8), stamp=0.0)
-    >>> prediction.depth.shape
-    torch.Size([48, 64])
+    >>> stream = DepthStream(load_model("dyfn-mini"), num_tokens=24)
+    >>> prediction = stream.push(np.full((48, 64, 3), 128, np.uint8), stamp=0.0)
+    >>> prediction.depth.shape, prediction.camera_matrix.shape
+    (torch.Size([48, 64]), (3, 3))
 
 No ROS dependency; the package dyfn_ros has the ROS 2 node and the recordings.
 """
 
 from typing import TYPE_CHECKING, Any
 
-# Read by type checkers, IDEs and pydoc only: see __getattr__.
+# Read by type checkers and IDEs only: see __getattr__.
 if TYPE_CHECKING:
+    from dyfn_core.metric.references import ConeReference as ConeReference
+    from dyfn_core.metric.references import DepthReference as DepthReference
+    from dyfn_core.metric.references import PointReference as PointReference
     from dyfn_core.models import CheckpointError as CheckpointError
     from dyfn_core.models import load_model as load_model
     from dyfn_core.models import save_model as save_model
@@ -23,15 +33,20 @@ if TYPE_CHECKING:
     from dyfn_core.stream.depth_stream import DepthStream as DepthStream
     from dyfn_core.stream.depth_stream import push_together as push_together
     from dyfn_core.stream.options import StreamOptions as StreamOptions
+    from dyfn_core.stream.saving import StateError as StateError
     from dyfn_core.stream.session import StreamSession as StreamSession
 
     __version__: str
 
 _HOMES = {
     "CheckpointError": "dyfn_core.models",
+    "ConeReference": "dyfn_core.metric.references",
+    "DepthReference": "dyfn_core.metric.references",
     "DepthStream": "dyfn_core.stream.depth_stream",
     "Frame": "dyfn_core.prediction",
+    "PointReference": "dyfn_core.metric.references",
     "Prediction": "dyfn_core.prediction",
+    "StateError": "dyfn_core.stream.saving",
     "StreamOptions": "dyfn_core.stream.options",
     "StreamSession": "dyfn_core.stream.session",
     "StreamState": "dyfn_core.prediction",
@@ -42,9 +57,13 @@ _HOMES = {
 
 __all__ = [
     "CheckpointError",
+    "ConeReference",
+    "DepthReference",
     "DepthStream",
     "Frame",
+    "PointReference",
     "Prediction",
+    "StateError",
     "StreamOptions",
     "StreamSession",
     "StreamState",

@@ -46,9 +46,11 @@ class Frame:
 class StreamState:
     """What the recurrence remembers between two frames; a value, never mutated.
 
-    hidden: hidden state h_t. ConvGRU: B x C x h x w, GRU: B x C.
-    ema_mean, ema_std: B x C, only for the GRU variant, whose statistics are an
-        exponential moving average; NaN in a row that has no history yet.
+    Attributes:
+        hidden: Hidden state h_t. ConvGRU: B x C x h x w, GRU: B x C.
+        ema_mean: B x C, only for the GRU variant, whose statistics are an exponential moving
+            average; NaN in a row that has no history yet.
+        ema_std: As ema_mean, for the standard deviation.
     """
 
     hidden: Tensor
@@ -57,10 +59,17 @@ class StreamState:
 
     @staticmethod
     def stack(states: Sequence[StreamState | None]) -> StreamState | None:
-        """States of several streams -> the state of their batch, in the same order.
+        """The state of a batch of streams.
 
-        A None (a stream at its first frame) becomes what None means: a zero hidden state and
-        no history. All None gives None. Raises ValueError when the shapes differ.
+        Args:
+            states: One of each stream (B of 1). None, a stream at its first frame, becomes what
+                it means: a zero hidden state and no history.
+
+        Returns:
+            The state of the batch, in the same order; None when all are None.
+
+        Raises:
+            ValueError: The shapes differ.
         """
         known = [state for state in states if state is not None]
         if not known:
@@ -77,7 +86,11 @@ class StreamState:
         )
 
     def unbind(self) -> list[StreamState]:
-        """The state of a batch of B streams -> B states of one stream each."""
+        """The states of the streams of a batch.
+
+        Returns:
+            B states of one stream each; the inverse of `stack`.
+        """
         hidden = self.hidden.split(1)
         none: list[Tensor | None] = [None] * len(hidden)
         means = none if self.ema_mean is None else list(self.ema_mean.split(1))
@@ -85,7 +98,14 @@ class StreamState:
         return [StreamState(*row) for row in zip(hidden, means, stds, strict=True)]
 
     def to(self, device: torch.device | str) -> StreamState:
-        """The same state on another device."""
+        """The same state on another device.
+
+        Args:
+            device: A torch device or its name.
+
+        Returns:
+            A state with tensors there.
+        """
         return StreamState(
             self.hidden.to(device),
             None if self.ema_mean is None else self.ema_mean.to(device),
@@ -172,7 +192,11 @@ class Prediction(Generic[ArrayT]):
         return self.depth, self.valid
 
     def numpy(self) -> Prediction[np.ndarray]:
-        """The same with numpy arrays in place of tensors."""
+        """The same with numpy arrays in place of tensors.
+
+        Returns:
+            A prediction on the CPU; the state keeps its tensors.
+        """
         return Prediction(
             _array(self.points),
             _array(self.depth),
@@ -187,6 +211,13 @@ class Prediction(Generic[ArrayT]):
         )
 
     def scaled(self, scale: float) -> Prediction[ArrayT]:
-        """The same in metres: points and depth times the metres of one unit."""
+        """The same in metres.
+
+        Args:
+            scale: Metres in one unit of this prediction.
+
+        Returns:
+            A prediction with points and depth times `scale`, and `metric` True.
+        """
         factor = np.float32(scale).item()
         return replace(self, points=self.points * factor, depth=self.depth * factor, metric=True)

@@ -60,13 +60,25 @@ class Reference(Protocol):
 
 @dataclass(frozen=True)
 class PointReference:
-    """points: N x 3 metres in the camera's optical frame, in any order; non-finite ones count
-    as missing."""
+    """Measured points, such as a lidar's or a radar's.
+
+    Attributes:
+        points: N x 3 metres in the camera's optical frame, in any order; non-finite ones count
+            as missing.
+    """
 
     points: np.ndarray
 
     def evidence(self, view: DepthView, stamp: float) -> Evidence:
-        """Pairs along the optical axis, at the nearest pixel of each point."""
+        """Pairs along the optical axis, at the nearest pixel of each point.
+
+        Args:
+            view: The predicted frame.
+            stamp: Its seconds.
+
+        Returns:
+            Predicted and measured depth, one pair a usable point.
+        """
         dropped: Counter[str] = Counter()
         points = np.asarray(self.points, np.float64).reshape(-1, 3)
         finite = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
@@ -81,13 +93,25 @@ class PointReference:
 
 @dataclass(frozen=True)
 class DepthReference:
-    """depth: h x w metres of the same view at any resolution (registered to the camera); NaN or
-    values <= 0 are missing."""
+    """A measured depth image of the same view.
+
+    Attributes:
+        depth: h x w metres at any resolution, registered to the camera; NaN or values <= 0 are
+            missing.
+    """
 
     depth: np.ndarray
 
     def evidence(self, view: DepthView, stamp: float) -> Evidence:
-        """Pairs at the pixel that the centre of each depth pixel falls on."""
+        """Pairs at the pixel that the centre of each depth pixel falls on.
+
+        Args:
+            view: The predicted frame.
+            stamp: Its seconds.
+
+        Returns:
+            Predicted and measured depth, one pair a usable pixel.
+        """
         dropped: Counter[str] = Counter()
         depth = np.asarray(self.depth, np.float64)
         known = np.isfinite(depth) & (depth > 0)
@@ -104,10 +128,12 @@ class DepthReference:
 class ConeReference:
     """One distance of a sensor that sees a whole cone, such as an ultrasonic ranger.
 
-    hit: 3, metres: the point at the measured distance on the cone's axis, in the camera's
-    optical frame. half_angle: of the cone, radians.
-    nearest: the sensor answers to the nearest surface in the cone (sound); else to the middle
-    of what it sees (a narrow infrared beam).
+    Attributes:
+        hit: 3, metres: the point at the measured distance on the cone's axis, in the camera's
+            optical frame.
+        half_angle: Half the opening angle of the cone, radians.
+        nearest: Whether the sensor answers to the nearest surface in the cone (sound); else to
+            the middle of what it sees (a narrow infrared beam).
     """
 
     hit: np.ndarray
@@ -121,6 +147,13 @@ class ConeReference:
         least the pixels next to the axis. The 10th percentile, not the minimum, because a few
         flying pixels at a depth edge would decide the minimum. The cone's apex is taken to be
         in the camera's centre, the hit's distance is measured from there.
+
+        Args:
+            view: The predicted frame.
+            stamp: Its seconds.
+
+        Returns:
+            One pair of distances; none when the footprint shows too little.
         """
         hit = np.asarray(self.hit, np.float64).reshape(3)
         distance = float(np.linalg.norm(hit))

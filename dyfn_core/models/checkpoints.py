@@ -187,10 +187,14 @@ def save_model(
     dtype: torch.dtype | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
-    """Write our format: safetensors with the config in its metadata; whole or not at all.
+    """Write a model to a .safetensors file, whole or not at all; load_model reads it again.
 
-    dtype: store floating-point weights in it (torch.float16 halves the file).
-    notes: further metadata, string to string; "format" and "config" are taken.
+    Args:
+        model: The model. Its config goes into the file's metadata.
+        path: The file, which is replaced if it exists.
+        dtype: Type of the stored floating-point weights (torch.float16 halves the file); None:
+            as they are.
+        notes: Further metadata, string to string; "format" and "config" are taken.
     """
     weights = {
         key: value.detach().to("cpu", dtype if value.is_floating_point() else None).contiguous()

@@ -203,7 +203,11 @@ class DepthStream:
             self.reset(NEW_CAMERA)
 
     def reset(self, reason: str = REQUESTED) -> None:
-        """Forget everything but the camera matrix; the next frame is a first frame."""
+        """Forget everything but the camera matrix; the next frame is a first frame.
+
+        Args:
+            reason: What `resets` counts it under.
+        """
         self.resets[reason] += 1
         self.memory, self._last_reset = StreamMemory(), reason
 
@@ -262,6 +266,9 @@ class DepthStream:
             affine: The frame's output, a batch of one.
             state: DyFN's state after the frame.
             stamp: Seconds.
+
+        Returns:
+            As push.
         """
         if isinstance(affine, AffineDisparity):
             return self._finish_disparity(affine.disparity, state, stamp)
@@ -377,6 +384,14 @@ def push_together(
 
     Raises:
         ValueError: The streams or the images do not fit together; nothing has then been pushed.
+
+    Example:
+        >>> from dyfn_core.models import load_model
+        >>> model = load_model("dyfn-mini")
+        >>> left, right = (DepthStream(model, num_tokens=24) for _ in range(2))
+        >>> images = [np.full((48, 64, 3), grey, np.uint8) for grey in (100, 150)]
+        >>> [tuple(found.depth.shape) for found in push_together([left, right], images)]
+        [(48, 64), (48, 64)]
     """
     stamps = [None] * len(streams) if stamps is None else stamps
     first = streams[0]

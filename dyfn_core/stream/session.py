@@ -139,6 +139,9 @@ class StreamSession:
     def request_reset(self, reason: str = REQUESTED) -> ResetRequest:
         """Reset the stream with the next frame.
 
+        Args:
+            reason: What `resets` counts it under.
+
         Returns:
             What to push frames with that come from now on. Frames that came before may still be
             pushed, with the value of `asked` from when they came: they see the old memory.
@@ -188,14 +191,22 @@ class StreamSession:
         return self._keeper.fingerprint
 
     def report(self) -> dict[str, str]:
-        """Name and value of what the stages know, and the model's fingerprint."""
+        """What the stages know, and the model's fingerprint.
+
+        Returns:
+            Name -> value, for diagnostics.
+        """
         found: dict[str, str] = {}
         for stage in self.stages:
             found.update(stage.report())
         return {**found, "model fingerprint": self.fingerprint[:12]}
 
     def problems(self) -> list[str]:
-        """What a user should look at."""
+        """What a user should look at.
+
+        Returns:
+            One line a problem; empty when there is none.
+        """
         return [problem for stage in self.stages for problem in stage.problems()]
 
     # The thread that pushes frames.
@@ -225,6 +236,10 @@ class StreamSession:
     def begin(self, frame: Frame, asked: ResetRequest | None = None) -> DepthStream:
         """The half of push before the network, for callers that run several cameras in a batch.
 
+        Args:
+            frame: As for push.
+            asked: As for push.
+
         Returns:
             The stream that the frame goes into (see push_together), reset if it must be. `end`
             follows, or `fail`.
@@ -244,7 +259,15 @@ class StreamSession:
         return self.stream
 
     def end(self, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
-        """The half of push after the network: the prediction of a begun frame, as arrays."""
+        """The half of push after the network.
+
+        Args:
+            frame: The frame that was begun.
+            prediction: What its stream gave, of one image.
+
+        Returns:
+            As push.
+        """
         found = prediction.numpy()
         valid = found.valid if frame.visible is None else found.valid & frame.visible
         found = replace(found, mask=valid, known_camera=frame.camera_matrix)
