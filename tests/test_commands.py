@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 
 import pytest
 
@@ -13,10 +15,14 @@ from dyfn_core.cli import train as dyfn_train
 from dyfn_core.cli.arguments import command_parser, renamed
 from dyfn_ros.demo import cli as dyfn_demo
 from dyfn_ros.record import cli as dyfn_record
+from dyfn_ros.replay import cli as dyfn_replay
+from dyfn_ros.replay import options as replay_options
 from dyfn_worlds import cli as dyfn_worlds
 
+WRITER = Path(__file__).parents[1] / "docs/write_cli.py"
 Main = Callable[[Sequence[str]], int]
 MAINS: dict[str, Main] = {
+    "dyfn-replay": dyfn_replay.main,
     "dyfn-record": dyfn_record.main,
     "dyfn-demo": dyfn_demo.main,
     "dyfn-eval": dyfn_eval.main,
@@ -24,6 +30,7 @@ MAINS: dict[str, Main] = {
     "dyfn-worlds": dyfn_worlds.main,
 }
 PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
+    "dyfn-replay": replay_options.parser,
     "dyfn-record": dyfn_record.parser,
     "dyfn-demo": dyfn_demo.parser,
     "dyfn-eval": dyfn_eval.parser,
@@ -34,6 +41,13 @@ EVAL = ["run", "--benchmark", "sintel", "--model", "dyfn-mini", "--data", ".", "
 WORLDS = ["--assets", ".", "--out", "o"]
 # A command line, and what its one line on stderr says.
 NONSENSE = [
+    ("dyfn-replay walk --out o --stride 0", "--stride: expected a whole number of 1 or more"),
+    ("dyfn-replay walk --out o --max-frames many", "--max-frames"),
+    ("dyfn-replay walk --out o --device tpu", "--device: expected auto, cpu, cuda or cuda:N"),
+    ("dyfn-replay walk --out o --write everything", "--write"),
+    ("dyfn-replay walk --out o --quantity depth", "--prediction-topic, which is not given"),
+    ("dyfn-replay no_such_recording --out o", "no_such_recording"),
+    ("dyfn-replay walk", "--out"),
     ("dyfn-record no_such_source --out o", "no_such_source does not exist"),
     ("dyfn-record . --out o --rate nan", "--rate: expected a finite number above 0, got 'nan'"),
     ("dyfn-record . --out o --stride -1", "--stride: expected a whole number of 1 or more"),
@@ -159,6 +173,14 @@ def test_the_demo_takes_its_recording_by_the_old_name_too(
     words: list[str], name: str, value: str
 ) -> None:
     assert getattr(dyfn_demo.parse(words), name).name == value
+
+
+def test_the_page_of_commands_is_current() -> None:
+    spec = spec_from_file_location("write_cli", WRITER)
+    assert spec is not None and spec.loader is not None
+    writer = module_from_spec(spec)
+    spec.loader.exec_module(writer)
+    assert writer.PAGE.read_text(encoding="utf-8") == writer.page(), f"run python {WRITER}"
 
 
 def test_eval_takes_its_old_names(capsys: pytest.CaptureFixture[str]) -> None:

@@ -220,7 +220,10 @@ def add_options(parser: argparse.ArgumentParser, kind: type = StreamOptions) -> 
         text = described.description.replace("%", "%%")
         if isinstance(default, bool):
             group.add_argument(
-                flag, action=argparse.BooleanOptionalAction, default=default, help=text
+                flag,
+                action=argparse.BooleanOptionalAction,
+                default=default,
+                help=f"{text} (default: %(default)s)",
             )
             continue
         shown = default if default != "" else "none"

@@ -10,9 +10,18 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.argument_types import above_zero, at_least_one, not_negative
+from dyfn_core.argument_types import above_zero, at_least_one
+from dyfn_core.cli.arguments import (
+    add_controls,
+    add_device,
+    add_max_frames,
+    add_model,
+    add_num_tokens,
+    add_stride,
+    add_threads,
+    command_parser,
+)
 from dyfn_core.quantities import DEPTH, QUANTITIES
-from dyfn_core.threads import THREADS
 from dyfn_ros.replay.settings import (
     DEFAULT,
     FILES,
@@ -63,9 +72,9 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     Returns:
         What it asks for.
     """
-    parser = _parser()
-    given = vars(parser.parse_args(arguments))
-    _check(parser, given)
+    made = parser()
+    given = vars(made.parse_args(arguments))
+    _check(made, given)
     recordings, names = tuple(given["recordings"]), tuple(given["image_topics"])
     chosen: Run | PredictionTopic = Run(**_of(Run, given))
     if given["prediction_topic"] is not None:
@@ -102,11 +111,12 @@ def _check(parser: argparse.ArgumentParser, given: dict[str, Any]) -> None:
         print(f"{parser.prog}: warning: {text}", file=sys.stderr)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="dyfn-replay",
-        description="Run recordings through the model, as the node would, and score them.",
-        epilog=EPILOG,
+def parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(
+        "dyfn-replay",
+        "Run recordings through the model, as the node would, and score them.",
+        EPILOG,
     )
     parser.add_argument(
         "recordings",
@@ -175,30 +185,14 @@ def _add_source(group: argparse._ArgumentGroup) -> None:
         default="header",
         help="times of the messages' headers, or times of recording (default: header)",
     )
-    add(
-        "--stride",
-        type=at_least_one,
-        default=1,
-        metavar="N",
-        help="take every N-th frame (default: 1)",
-    )
-    add(
-        "--max-frames",
-        type=at_least_one,
-        metavar="N",
-        help="stop after N frames (default: all)",
-    )
+    add_stride(group)
+    add_max_frames(group)
 
 
 def _add_stream(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
     add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
-    add(
-        "--num-tokens",
-        type=at_least_one,
-        metavar="N",
-        help="resolution inside the model, in tokens (default: the model's own)",
-    )
+    add_num_tokens(group)
     add(
         "--scene-cut-threshold",
         type=above_zero,
@@ -211,27 +205,11 @@ def _add_stream(group: argparse._ArgumentGroup) -> None:
 
 def _add_run(group: argparse._ArgumentGroup) -> None:
     add = group.add_argument
-    add(
-        "--model",
-        default="dyfn-mini",
-        help="bundled name, checkpoint file, or Hub id (default: dyfn-mini)",
-    )
-    add("--device", default="cpu", help="cpu, cuda or cuda:N (default: cpu)")
-    add(
-        "--threads",
-        type=not_negative,
-        default=THREADS,
-        metavar="N",
-        help="CPU threads for inference, on which the result does not depend "
-        f"(default: {THREADS}; 0: torch's own choice)",
-    )
+    add_model(group)
+    add_device(group)
+    add_threads(group)
     add("--compare", action="store_true", help="also run the base model, for one report on both")
-    add(
-        "--controls",
-        action="store_true",
-        help="also run the model with a moving average of the latent's statistics, and with those "
-        "of the first frame, in DyFN's place; each takes as long as the run itself",
-    )
+    add_controls(group, default=False)
     add(
         "--prediction-topic",
         metavar="TOPIC",
@@ -252,7 +230,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
         dest="folder",
         type=Path,
         required=True,
-        metavar="FOLDER",
+        metavar="DIR",
         help="folder for the results",
     )
     add(
@@ -261,7 +239,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
         default=DEFAULT,
         metavar="LIST",
         help=f"files beside scores and report: some of {','.join(FILES)}, or none "
-        f"(default: {','.join(DEFAULT)})",
+        "(default: mcap,ply, and video where the extra `video` is installed)",
     )
     add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")
     add(

@@ -57,7 +57,7 @@ class Run:
 
     Attributes:
         model: Bundled name, checkpoint file or Hub id.
-        device: "cpu", "cuda" or "cuda:N".
+        device: "auto" (a GPU if there is one), "cpu", "cuda" or "cuda:N".
         threads: CPU threads of inference; 0: torch's own choice.
         stabilizer: With DyFN; False: the base model alone.
         num_tokens: Resolution inside the model; None: the model's own.
@@ -67,7 +67,7 @@ class Run:
     """
 
     model: str = "dyfn-mini"
-    device: str = "cpu"
+    device: str = "auto"
     threads: int = THREADS
     stabilizer: bool = True
     num_tokens: int | None = None

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
+from dyfn_core.cli.arguments import command_parser
 from dyfn_ros.node.parameters.table import (
     CONFIGURE,
     LIMITS,
@@ -44,13 +45,15 @@ def usage(arguments: Sequence[str]) -> None:
         for name, spec in specs.items():
             lines.append(f"  {name} [{show(spec.default)}]")
             lines += wrap(spec.description, 90, initial_indent=" " * 6, subsequent_indent=" " * 6)
-    parser = argparse.ArgumentParser(
-        prog="stream_depth",
-        usage="stream_depth [--ros-args -r image:=TOPIC -r camera_info:=TOPIC -p NAME:=VALUE ...]",
-        description="Images in, depth and clouds out. Parameters and [defaults]:",
-        epilog="\n".join(lines),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "stream_depth",
+        "Images in, depth and clouds out. Parameters and [defaults]:",
+        "\n".join(lines),
     )
+    parser.usage = (
+        "stream_depth [--ros-args -r image:=TOPIC -r camera_info:=TOPIC -p NAME:=VALUE ...]"
+    )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.parse_args(remove_ros_args(list(arguments))[1:])
 
 
