@@ -2,9 +2,9 @@
 
     python benchmarks/latent_cache.py CONFIG [--steps N] [--set KEY=VALUE ...]
 
-CONFIG is one of `dyfn-train stabilizer`. Both ways take the same optimizer steps on batches of the
-same shape; without a cache every step renders, augments and encodes clips of its own. Blocks of
-steps alternate between the two, so that whatever else the machine does hits both alike.
+CONFIG is one of `dyfn-train dyfn`, method unrolled. Both ways take the same optimizer steps on
+batches of the same shape; without a cache every step renders, augments and encodes clips of its
+own. Blocks of steps alternate between the two, so that whatever else the machine does hits both.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from typing import Any
 
 import torch
 
-from dyfn_core.training.config import StabilizerRunConfig, read_config
-from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.config import read_config
+from dyfn_core.training.dyfn_config import DyFNRunConfig, UnrolledMethod
+from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 
 
 class Way:
     """A task with an optimizer of its own, timed step by step."""
 
-    def __init__(self, task: StabilizerTask) -> None:
+    def __init__(self, task: UnrolledTask) -> None:
         self.task = task
         self.optimizer = torch.optim.AdamW(task.groups())
         self.batches: Iterator[Any] = task.batches(0)
@@ -49,21 +50,22 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     options = parser.parse_args()
-    sets = ["cache_draws=4", *options.set]
+    sets = ["method.cache_draws=4", *options.set]
     with tempfile.TemporaryDirectory() as folder:
-        config = read_config(options.config, StabilizerRunConfig, sets)
-        without = read_config(options.config, StabilizerRunConfig, [*sets, "cache_draws=0"])
+        config = read_config(options.config, DyFNRunConfig, sets)
+        without = read_config(options.config, DyFNRunConfig, [*sets, "method.cache_draws=0"])
         torch.set_num_threads(config.threads)
         start = time.perf_counter()
-        cached = Way(StabilizerTask(config, Path(folder)))
+        cached = Way(UnrolledTask(config, Path(folder)))
         built = time.perf_counter() - start
-        fresh = Way(StabilizerTask(without, Path(folder)))
+        fresh = Way(UnrolledTask(without, Path(folder)))
         for block in range(options.steps // 4 + 1):
             for way in (cached, fresh):
                 for _ in range(4 if block else 1):  # the first block warms up
                     way.step()
     with_cache, no_cache = median(cached.times[1:]), median(fresh.times[1:])
-    frames = config.cache_draws * config.stages[0].batch * config.cache_length
+    assert isinstance(config.method, UnrolledMethod)
+    frames = config.method.cache_draws * config.stages[0].batch * config.method.cache_length
     print("| | median step | steps/s | ratio |\n| --- | --- | --- | --- |")
     print(f"| no cache | {1000 * no_cache:.0f} ms | {1 / no_cache:.2f} | 1.0 |")
     ratio = no_cache / with_cache

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from dyfn_core.argument_types import at_least_one
@@ -25,11 +26,20 @@ from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
     RunConfig,
-    ScaleRunConfig,
-    StabilizerRunConfig,
     read_config,
+    read_values,
+    settings_of,
+)
+from dyfn_core.training.dyfn_config import DyFNRunConfig, UnrolledMethod
+from dyfn_core.training.former_config import (
+    METHODS,
+    SCALE,
+    STABILIZER,
+    former_command,
+    translated,
 )
 from dyfn_core.training.loop.processes import Processes
+from dyfn_core.training.loop.run_folder import CONFIG_FILE
 from dyfn_core.training.loop.trainer import (
     BEST_FILE,
     MODEL_FILE,
@@ -40,8 +50,9 @@ from dyfn_core.training.loop.trainer import (
 )
 from dyfn_core.training.scaling_curve import draw_curve, last_doubling, scaling_curve, write_csv
 from dyfn_core.training.tasks.base import BaseTask
-from dyfn_core.training.tasks.dyfn_linearized import ScaleTask
-from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.dyfn import DyFNTask
+from dyfn_core.training.tasks.dyfn_linearized import LinearizedTask
+from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 from dyfn_core.training.tasks.task import Task
 
 FINE_TUNING = Path(__file__).parents[1] / "training" / "fine_tuning.yaml"
@@ -87,21 +98,52 @@ def _trainer(options: argparse.Namespace) -> Trainer:
             raise ConfigError("base: give a config; there is no default one")
         config = base = read_config(options.config, BaseRunConfig, overrides)
         make: Callable[..., Task] = partial(BaseTask, base)
-    elif options.command == "scale":
-        if options.config is None:
-            raise ConfigError("scale: give a config; there is no default one")
-        config = scale = read_config(options.config, ScaleRunConfig, overrides)
-        make = partial(ScaleTask, scale, options.out / "summaries")
     else:
-        if options.config is None and not options.data:
-            raise ConfigError("stabilizer: give a config, or --data to fine-tune on")
-        path = options.config or FINE_TUNING
-        config = stabilizer = read_config(path, StabilizerRunConfig, overrides)
-        make = partial(StabilizerTask, stabilizer, options.out / "latents")
+        config = dyfn = _dyfn_config(options, overrides)
+        make = partial(_dyfn_task, dyfn, options.out)
     check_folder(options.out, options.resume)  # before anything long is begun
     processes = Processes(config)
     task = make(device=processes.device)
     return Trainer(task, config, options.out, options.resume, processes)
+
+
+def _dyfn_config(options: argparse.Namespace, overrides: list[str]) -> DyFNRunConfig:
+    """The settings of `dyfn`, and of its two former names translated."""
+    command = options.command
+    if options.config is None and (command == SCALE or not options.data):
+        instead = "" if command == SCALE else ", or --data to fine-tune on"
+        raise ConfigError(f"{command}: give a config{instead}")
+    path = options.config or FINE_TUNING
+    values = read_values(path, overrides)
+    former = former_command(values)
+    if command in METHODS:
+        print(
+            f"dyfn-train: `{command}` is now `dyfn` with method.kind {METHODS[command]!r}; "
+            f"{options.out / CONFIG_FILE} is the config in that form",
+            file=sys.stderr,
+        )
+        values = _translated(values, command, path)
+    elif former is not None:
+        raise ConfigError(
+            f"{path} is a config of `dyfn-train {former}`, which still takes it and writes it in "
+            f"the form of `dyfn` to OUT/{CONFIG_FILE}; or see docs/training.md for `method`"
+        )
+    return settings_of(values, DyFNRunConfig, path)
+
+
+def _translated(values: dict[str, Any], command: str, path: Path) -> dict[str, Any]:
+    method = values.get("method")
+    kind = method.get("kind") if isinstance(method, dict) else None
+    if kind not in (None, METHODS[command]):
+        raise ConfigError(f"{path} has method.kind {kind!r}: give it to `dyfn`")
+    return translated(values, command)
+
+
+def _dyfn_task(config: DyFNRunConfig, out: Path, device: torch.device) -> DyFNTask:
+    if isinstance(config.method, UnrolledMethod):
+        return UnrolledTask(config, out / "latents", device)
+    former = out / "summaries"  # of runs of an earlier version
+    return LinearizedTask(config, former if former.exists() else out / "gru_inputs", device)
 
 
 def _tell_result(trainer: Trainer) -> None:
@@ -175,12 +217,15 @@ def parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     purposes = {
         "base": "train encoder and head on rendered frames",
-        "stabilizer": "train DyFN on clips or recordings, everything else frozen",
-        "scale": "teach DyFN's recurrence the base's errors of scale, without decoding",
+        "dyfn": "train DyFN on clips or recordings, everything else frozen",
+        STABILIZER: "former name of `dyfn` with method.kind 'unrolled'",
+        SCALE: "former name of `dyfn` with method.kind 'linearized'",
     }
     for name, purpose in purposes.items():
         command = commands.add_parser(name, help=purpose, description=described(purpose))
-        command.add_argument("config", type=Path, nargs="?", help="YAML file with the settings")
+        command.add_argument(
+            "config", type=Path, nargs="?", help="YAML file of settings, or a shipped one's name"
+        )
         command.add_argument(
             "--data",
             action="append",

@@ -29,9 +29,10 @@ class Experiment:
     kind: str = "trained"
 
 
-ALIGN_FIRST = {"align_first_weight": 1.0, "align_all_weight": 0.0}
-ALIGN_ALL = {"align_first_weight": 0.0, "align_all_weight": 1.0}
-ALIGN_NOT = {"align_first_weight": 0.0, "align_all_weight": 0.0}
+_TERMS = "method.objective"
+ALIGN_FIRST = {f"{_TERMS}.align_first_weight": 1.0, f"{_TERMS}.align_all_weight": 0.0}
+ALIGN_ALL = {f"{_TERMS}.align_first_weight": 0.0, f"{_TERMS}.align_all_weight": 1.0}
+ALIGN_NOT = {f"{_TERMS}.align_first_weight": 0.0, f"{_TERMS}.align_all_weight": 0.0}
 CLIP_LENGTHS = (8, 12, 16, 24)
 BASE = Arm("DyFN")
 
@@ -56,8 +57,8 @@ EXPERIMENTS = (
         "Video AbsRel with and without: Sintel .180 and .183, ScanNet .073 and .069, "
         "KITTI .062 and .063, Bonn .044 and .044.",
         (
-            Arm("with L_temp", {"temporal_weight": 0.1}),
-            Arm("without L_temp", {"temporal_weight": 0.0}),
+            Arm("with L_temp", {f"{_TERMS}.temporal_weight": 0.1}),
+            Arm("without L_temp", {f"{_TERMS}.temporal_weight": 0.0}),
         ),
     ),
     Experiment(
@@ -65,7 +66,7 @@ EXPERIMENTS = (
         "Is the ConvGRU better than a GRU on the pooled latent?",
         "Video AbsRel, ConvGRU and GRU: Sintel .180 and .187, ScanNet .073 and .078, "
         "KITTI .062 and .065, Bonn .044 and .053.",
-        (Arm("ConvGRU", {"stabilizer.kind": "convgru"}), Arm("GRU", {"stabilizer.kind": "gru"})),
+        (Arm("ConvGRU", {"dyfn.kind": "convgru"}), Arm("GRU", {"dyfn.kind": "gru"})),
     ),
     Experiment(
         "alignment",
@@ -79,15 +80,15 @@ EXPERIMENTS = (
         "Are statistics better replaced (the paper's form) or corrected (the residual form)?",
         "The paper has the first form only.",
         (
-            Arm("paper's form", {"stabilizer.form": "paper"}),
-            Arm("residual", {"stabilizer.form": "residual"}),
+            Arm("paper's form", {"dyfn.form": "paper"}),
+            Arm("residual", {"dyfn.form": "residual"}),
         ),
     ),
     Experiment(
         "clip-length",
         "How long must training clips be?",
         "No difference beyond .005 between 8, 12, 16 and 24 frames.",
-        tuple(Arm(f"{length} frames", {"length": length}) for length in CLIP_LENGTHS),
+        tuple(Arm(f"{length} frames", {"method.length": length}) for length in CLIP_LENGTHS),
     ),
     Experiment(
         "long-sequences",

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import logging
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from dyfn_core.data.clips import find_sequences
 from dyfn_core.data.sequences import clip_frames, folder_frames
@@ -23,17 +27,20 @@ from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.scoring.variants import VariantScore
-from dyfn_core.training.config import StabilizerRunConfig, read_config
+from dyfn_core.training.config import ConfigError, override, read_values, settings_of
+from dyfn_core.training.dyfn_config import DyFNRunConfig, UnrolledMethod
+from dyfn_core.training.former_config import STABILIZER, former_command, translated
 from dyfn_core.training.loop.checkpoint import has_state
 from dyfn_core.training.loop.processes import Processes
-from dyfn_core.training.loop.run_folder import RESULTS_FILE
+from dyfn_core.training.loop.run_folder import CONFIG_FILE, RESULTS_FILE
 from dyfn_core.training.loop.trainer import MODEL_FILE, Trainer, TrainingError
 from dyfn_core.training.tasks.base import clip_source
-from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 
 HELD_OUT = "held-out clips"
 CACHE_SEED = 0  # one cache serves the runs of all seeds
-BOOKKEEPING = {"seed", "cache", "cache_seed"}  # what the runs of one arm may differ in
+# What the runs of one arm may differ in.
+BOOKKEEPING: Any = {"seed": True, "method": {"cache": True, "cache_seed": True}}
 
 logger = logging.getLogger(__name__)
 
@@ -42,9 +49,9 @@ logger = logging.getLogger(__name__)
 class Plan:
     """What experiments have in common.
 
-    config: YAML file of a StabilizerRunConfig; overrides: KEY=VALUE on top of it. out: folder of
-    all runs. seeds: how often each arm is trained. recordings: folders to score on besides the
-    held-out clips of the config's data, of which `clips` are taken; stride: every so-many-th
+    config: YAML file of a DyFNRunConfig, method unrolled; overrides: KEY=VALUE on top of it. out:
+    folder of all runs. seeds: how often each arm is trained. recordings: folders to score on
+    besides the held-out clips of the config's data, of which `clips` are taken; stride: every N-th
     frame of either.
     """
 
@@ -74,6 +81,9 @@ class Runner:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
+        self._values = read_values(plan.config, plan.overrides)
+        if former_command(self._values) == STABILIZER:
+            self._values = translated(self._values, STABILIZER)
         self.config = self._settings(Arm(""), 0)
         self.model = load_model(self.config.base)
         self.model.stabilizer = None
@@ -114,13 +124,13 @@ class Runner:
     def train(self, arm: Arm, seed: int) -> Path:
         """The folder of a finished run of an arm; it goes on where it stopped, if it did."""
         config = self._settings(arm, seed)
-        folder = self.plan.out / "runs" / _digest(config) / f"seed_{seed}"
+        folder = self._folder(_digest(config), seed)
         if (folder / RESULTS_FILE).exists():
             logger.info("%s, seed %d: finished before", arm.name, seed)
             return folder
         logger.info("%s, seed %d", arm.name, seed)
         processes = Processes(config)
-        task = StabilizerTask(config, self.plan.out / "latents", processes.device)
+        task = UnrolledTask(config, self.plan.out / "latents", processes.device)
         Trainer(task, config, folder, has_state(folder), processes).train()
         return folder
 
@@ -135,17 +145,34 @@ class Runner:
             _write_json(path, found)
         return {name: VariantScore(**s) for name, s in json.loads(path.read_text()).items()}
 
-    def _settings(self, arm: Arm, seed: int) -> StabilizerRunConfig:
-        own = {
-            **arm.overrides,
-            "seed": seed,
-            "cache_seed": CACHE_SEED,
-            "cache": str(self.plan.out / "latents"),
-        }
-        overrides = [f"{key}={json.dumps(value)}" for key, value in own.items()]
-        return read_config(
-            self.plan.config, StabilizerRunConfig, [*self.plan.overrides, *overrides]
-        )
+    def _folder(self, digest: str, seed: int) -> Path:
+        """Of a run; one of an earlier version with the same settings counts as that run."""
+        folder = self.plan.out / "runs" / digest / f"seed_{seed}"
+        return folder if folder.exists() else self._former_runs.get((digest, seed), folder)
+
+    @cached_property
+    def _former_runs(self) -> dict[tuple[str, int], Path]:
+        """Digest and seed -> folder of the runs whose config is of `dyfn-train stabilizer`."""
+        found = {}
+        for path in self.plan.out.glob(f"runs/*/seed_*/{CONFIG_FILE}"):
+            values = yaml.safe_load(path.read_text())
+            if former_command(values) == STABILIZER:
+                plain = translated(values, STABILIZER, tell=False)
+                config = settings_of(plain, DyFNRunConfig, path)
+                found[_digest(config), config.seed] = path.parent
+        return found
+
+    def _settings(self, arm: Arm, seed: int) -> DyFNRunConfig:
+        values = copy.deepcopy(self._values)
+        for key, value in {**arm.overrides, "seed": seed}.items():
+            override(values, f"{key}={json.dumps(value)}")
+        config = settings_of(values, DyFNRunConfig, self.plan.config)
+        if not isinstance(config.method, UnrolledMethod):
+            raise ConfigError(f"{self.plan.config}: experiments need method.kind 'unrolled'")
+        if not config.method.cache_draws:
+            return config
+        shared = {"cache": self.plan.out / "latents", "cache_seed": CACHE_SEED}
+        return config.model_copy(update={"method": config.method.model_copy(update=shared)})
 
     def _measure(self) -> str:
         """Short name of what is scored on, and with which base."""
@@ -157,7 +184,7 @@ class Runner:
 
 
 def encode_all(
-    model: GeometryModel, config: StabilizerRunConfig, plan: Plan, stride: int
+    model: GeometryModel, config: DyFNRunConfig, plan: Plan, stride: int
 ) -> dict[str, list[EncodedSequence]]:
     """The plan's recordings, and held-out clips of the config's data, by data set.
 
@@ -182,10 +209,10 @@ def encode_all(
     return found
 
 
-def _digest(config: StabilizerRunConfig) -> str:
+def _digest(config: DyFNRunConfig) -> str:
     """Short name of an arm's settings; arms of different experiments that agree share runs."""
     plain: dict[str, Any] = config.model_dump(mode="json", exclude=BOOKKEEPING)
-    plain["stabilizer"] = DyFNConfig(**config.stabilizer).to_dict()
+    plain["dyfn"] = DyFNConfig(**config.dyfn).to_dict()
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
 
 

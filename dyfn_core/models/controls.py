@@ -25,11 +25,11 @@ class StatisticsControl(DyFN):
             raise ValueError(f"alpha must be in 0..1, got {alpha}")
         self.alpha = alpha
 
-    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+    def gru_input(self, features: Tensor, mean: Tensor) -> Tensor:
         return mean
 
     def _step(
-        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+        self, gru_input: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         if state is not None and state.ema_mean is not None and state.ema_std is not None:
             mean = torch.lerp(state.ema_mean, mean, self.alpha)

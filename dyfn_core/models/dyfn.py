@@ -118,37 +118,37 @@ class DyFN(nn.Module, ABC):
         self, features: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         """One step of the recurrence -> gamma, beta (B x C), next state."""
-        return self.recur(self.summarise(features, mean), mean, std, state)
+        return self.recur(self.gru_input(features, mean), mean, std, state)
 
     @abstractmethod
-    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+    def gru_input(self, features: Tensor, mean: Tensor) -> Tensor:
         """What the recurrence sees of a latent: B x C, or B x C x h' x w'."""
 
     def recur(
-        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+        self, gru_input: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
-        """As remember, from a summary; the residual form has no use for mean and std."""
-        gamma, beta, after = self._step(summary, mean, std, state)
+        """As remember, from what `gru_input` gives; the residual form does not use mean and std."""
+        gamma, beta, after = self._step(gru_input, mean, std, state)
         if not self.config.memory_only:
             return gamma, beta, after
         if state is None:
             return torch.zeros_like(gamma), torch.zeros_like(beta), after
-        alone_gamma, alone_beta, _ = self._step(summary, mean, std, None)
+        alone_gamma, alone_beta, _ = self._step(gru_input, mean, std, None)
         return gamma - alone_gamma, beta - alone_beta, after
 
     @abstractmethod
     def _step(
-        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+        self, gru_input: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
         """gamma and beta (B x C) of the hidden state after this frame, and the next state."""
 
-    def standardized(self, summary: Tensor) -> Tensor:
-        """The summary in units of its usual values, when the config asks for that."""
+    def standardized(self, gru_input: Tensor) -> Tensor:
+        """The input in units of its usual values, when the config asks for that."""
         if not self.config.standardize:
-            return summary
+            return gru_input
         mean, std = self.get_buffer("usual_mean"), self.get_buffer("usual_std")
-        shape = (1, -1) + (1,) * (summary.dim() - 2)
-        return (summary - mean.view(shape)) / std.view(shape)
+        shape = (1, -1) + (1,) * (gru_input.dim() - 2)
+        return (gru_input - mean.view(shape)) / std.view(shape)
 
     def _previous(self, shape: tuple[int, ...], state: StreamState | None, like: Tensor) -> Tensor:
         if state is None:
@@ -191,9 +191,9 @@ class ConvGRUDyFN(DyFN):
         nn.init.zeros_(self.beta_head.bias)  # type: ignore[arg-type]
 
     def _step(
-        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+        self, gru_input: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
-        x = self.standardized(summary)
+        x = self.standardized(gru_input)
         shape = (x.shape[0], self.config.hidden, x.shape[2], x.shape[3])
         hidden = self.conv_gru_cell(x, self._previous(shape, state, x))
         average = hidden.mean(dim=(-2, -1), keepdim=True)
@@ -206,7 +206,7 @@ class ConvGRUDyFN(DyFN):
             gamma = F.softplus(self.gamma_head(hidden)).mean(dim=(-2, -1))
         return gamma, beta, StreamState(hidden)
 
-    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+    def gru_input(self, features: Tensor, mean: Tensor) -> Tensor:
         pool = self.config.pool
         if pool == 1:
             return features
@@ -230,13 +230,13 @@ class GRUDyFN(DyFN):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)
 
-    def summarise(self, features: Tensor, mean: Tensor) -> Tensor:
+    def gru_input(self, features: Tensor, mean: Tensor) -> Tensor:
         return mean
 
     def _step(
-        self, summary: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
+        self, gru_input: Tensor, mean: Tensor, std: Tensor, state: StreamState | None
     ) -> tuple[Tensor, Tensor, StreamState]:
-        x = self.standardized(summary)
+        x = self.standardized(gru_input)
         shape = (x.shape[0], self.config.hidden)
         hidden = self.gru_cell(x, self._previous(shape, state, x))
         gamma, beta = self.gamma_delta_head(hidden), self.beta_delta_head(hidden)

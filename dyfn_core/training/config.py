@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -21,12 +23,17 @@ from dyfn_core.data.datasets import AUTO, RENDERED, data_kind
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec
 from dyfn_core.data.rendered import SPLITS
-from dyfn_core.losses.full.objective import Objective
-from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.models.mini import MiniConfig
 from dyfn_core.training.config_errors import check_fields, describe
 
 Settings = TypeVar("Settings", bound="RunConfig")
+
+# What config files were called before -> what they are called.
+FORMER_NAMES = {
+    "train_scale_mini.yaml": "train_dyfn_mini.yaml",
+    "train_stabilizer_mini.yaml": "train_dyfn_unrolled_mini.yaml",
+}
+logger = logging.getLogger(__name__)
 
 
 class ConfigError(ValueError):
@@ -134,7 +141,6 @@ class RunConfig(Strict):
     log_every: int = Field(20, ge=1)
     picture_every: int = Field(500, ge=1)
     validate_every: int = Field(1000, ge=1)
-    validation_frames: int = Field(48, ge=1)
     validation_rgbd: Path | None = None
 
     @field_validator("stages")
@@ -151,8 +157,8 @@ class BaseRunConfig(RunConfig):
 
     encoder_rate: the encoder's learning rate relative to the head's. frozen_blocks: the stem and
     so many encoder blocks keep their ImageNet weights. frozen_depthwise: so do all the encoder's
-    depthwise filters. model: fields of MiniConfig. initial: a
-    checkpoint to start from instead of ImageNet weights.
+    depthwise filters. validation_frames: rendered ones to validate on. model: fields of
+    MiniConfig. initial: a checkpoint to start from instead of ImageNet weights.
     """
 
     model: dict[str, Any] = Field(default_factory=dict)
@@ -160,6 +166,7 @@ class BaseRunConfig(RunConfig):
     encoder_rate: float = Field(0.1, ge=0)
     frozen_blocks: int = Field(3, ge=0, le=16)
     frozen_depthwise: bool = True
+    validation_frames: int = Field(48, ge=1)
     local_weight: float = Field(1.0, ge=0)
     normal_weight: float = Field(0.05, ge=0)
     normal_stride: int = Field(4, ge=1)
@@ -174,143 +181,100 @@ class BaseRunConfig(RunConfig):
         return check_fields(value, MiniConfig)
 
 
-class StabilizerRunConfig(RunConfig):
-    """`dyfn-train stabilizer`: DyFN on a frozen base.
+def read_config(path: Path, kind: type[Settings], overrides: Sequence[str]) -> Settings:
+    """Read the settings of a run.
 
-    base: a checkpoint of any model. stabilizer: fields of DyFNConfig. warm_start: go on from
-    the base's own DyFN instead of a fresh one. cache: folder of encoded clips (default:
-    OUT/latents); cache_draws: batches of `stages[0].batch` clips in it, 0 for no cache: every
-    step then encodes clips of its own; cache_seed: of its draws (default: `seed`);
-    cache_length: frames of a cached clip, `strides` apart. clips: clips of a training batch;
-    length: frames unrolled; decoded: frames of them that the losses see. windows: of the temporal
-    loss. The four weights: L_align from the first frame and from all, L_temp, and each frame's
-    own error. align_differentiable: gradients flow through the first frame's alignment (the
-    paper detaches it). A base of disparity is trained with L_ssi and L_temp as in the paper:
-    ssi_weight, temporal_weight, and disparity_align_weight for first-frame alignment in disparity
-    space. objective: fields of losses.full.objective.Objective; given, it replaces the terms above
-    for a base of points, and every unrolled frame is decoded. validation_stride: every
-    so-many-th frame of the recording.
+    Relative paths in them are relative to the working directory.
+
+    Args:
+        path: YAML file, or the name of a shipped one (`find_config`).
+        kind: What the settings are of.
+        overrides: `key=value` or `key.sub=value`, put on top of the file's.
+
+    Returns:
+        The settings.
+
+    Raises:
+        ConfigError: For what cannot be used; names file, key and what was expected.
     """
-
-    base: Path
-    kinds: tuple[str, ...] = ("clip",)
-    stabilizer: dict[str, Any] = Field(default_factory=dict)
-    warm_start: bool = False
-    cache: Path | None = None
-    cache_draws: int = Field(200, ge=0)
-    cache_seed: int | None = None
-    cache_length: int = Field(32, ge=2)
-    strides: tuple[int, int] = (3, 8)
-    clips: int = Field(4, ge=1)
-    length: int = Field(16, ge=2)
-    decoded: int = Field(8, ge=2)
-    windows: tuple[int, ...] = (1, 2, 4)
-    align_differentiable: bool = True
-    align_first_weight: float = Field(1.0, ge=0)
-    align_all_weight: float = Field(0.5, ge=0)
-    temporal_weight: float = Field(0.1, ge=0)
-    frame_weight: float = Field(0.2, ge=0)
-    spread_weight: float = Field(1.0, ge=0)
-    ssi_weight: float = Field(1.0, ge=0)
-    disparity_align_weight: float = Field(0.0, ge=0)
-    objective: dict[str, Any] | None = None
-    validation_clips: int = Field(8, ge=1)
-    validation_stride: int = Field(4, ge=1)
-
-    @field_validator("stabilizer")
-    @classmethod
-    def _describes_a_stabilizer(cls, value: dict[str, Any]) -> dict[str, Any]:
-        return check_fields(value, DyFNConfig)
-
-    @field_validator("objective")
-    @classmethod
-    def _describes_an_objective(cls, value: dict[str, Any] | None) -> dict[str, Any] | None:
-        return None if value is None else check_fields(value, Objective)
-
-    @model_validator(mode="after")
-    def _fits(self) -> StabilizerRunConfig:
-        if self.length > self.cache_length:
-            raise ValueError(f"length {self.length} exceeds cache_length {self.cache_length}")
-        if self.warm_start and self.stabilizer:
-            raise ValueError("warm_start keeps the base's DyFN: remove the `stabilizer` settings")
-        if not 1 <= self.strides[0] <= self.strides[1]:
-            raise ValueError(f"strides must rise from 1 or more, got {self.strides}")
-        return self
-
-    def loss_weights(self) -> dict[str, float]:
-        """Weight of each term by its logged name."""
-        return {
-            "align_first": self.align_first_weight,
-            "align_all": self.align_all_weight,
-            "temporal": self.temporal_weight,
-            "frame": self.frame_weight,
-            "spread": self.spread_weight,
-        }
-
-    def disparity_weights(self) -> dict[str, float]:
-        """The same for a base of disparity."""
-        return {
-            "ssi": self.ssi_weight,
-            "temporal": self.temporal_weight,
-            "align_first": self.disparity_align_weight,
-        }
+    return settings_of(read_values(path, overrides), kind, path)
 
 
-class ScaleRunConfig(StabilizerRunConfig):
-    """`dyfn-train scale`: DyFN's recurrence from the scale errors of the base's own frames.
-
-    summary_draws: clips of `cache_length` frames that are summarised, once, in `cache`; a clip of
-    training is `length` of its frames, sub_strides apart. spread_weight, video_weight, size_weight,
-    change_weight: of the spread of the scale errors, of the video protocol's error, of the errors'
-    size and of the corrections'. noise: added to the summaries, in units of their deviation.
-    """
-
-    cache_draws: int = Field(0, ge=0, le=0)
-    summary_draws: int = Field(400, ge=1)
-    cache_length: int = Field(48, ge=2)
-    strides: tuple[int, int] = (1, 1)
-    sub_strides: tuple[int, int] = (1, 3)
-    clips: int = Field(12, ge=1)
-    video_weight: float = Field(1.0, ge=0)
-    size_weight: float = Field(0.2, ge=0)
-    change_weight: float = Field(0.02, ge=0)
-    noise: float = Field(0.15, ge=0)
-
-
-def read_config(path: Path, kind: type[Settings], overrides: list[str]) -> Settings:
-    """The settings in a YAML file with `key=value` (or `key.sub=value`) overrides on top.
-
-    Relative paths in it are relative to the working directory. Raises ConfigError.
-    """
+def read_values(path: Path, overrides: Sequence[str]) -> dict[str, Any]:
+    """Read a YAML file of settings, unchecked; as read_config otherwise."""
+    path = find_config(path)
     try:
         values = yaml.safe_load(path.read_text())
-    except FileNotFoundError as error:
-        raise ConfigError(f"no training config at {path}") from error
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ConfigError(
             f"{path} is no readable YAML file of settings (data are given with --data): {error}"
         ) from error
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected a mapping of settings")
-    for override in overrides:
-        _override(values, override)
+    for text in overrides:
+        override(values, text)
+    return values
+
+
+def settings_of(values: Mapping[str, Any], kind: type[Settings], source: Path) -> Settings:
+    """Check settings. source: the file they are from, for messages. Raises ConfigError."""
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        problems = "\n  ".join(describe(error, kind))
-        raise ConfigError(f"{path}:\n  {problems}") from error
+        problems = "\n  ".join(describe(error, kind, values))
+        raise ConfigError(f"{source}:\n  {problems}") from error
 
 
-def _override(values: dict[str, Any], override: str) -> None:
-    key, found, text = override.partition("=")
+def find_config(path: Path) -> Path:
+    """Find a config file from any working directory.
+
+    Args:
+        path: A file, or the name of a shipped one: train_dyfn_mini.yaml, with or without config/.
+
+    Returns:
+        The file.
+
+    Raises:
+        ConfigError: If there is none; names the shipped ones.
+    """
+    if path.exists():
+        return path
+    folders = config_folders(Path(__file__))
+    if path.parent in (Path(), Path("config")):
+        name = FORMER_NAMES.get(path.name, path.name)
+        for folder in folders:
+            if (folder / name).is_file():
+                if name != path.name:
+                    logger.warning("%s is now called config/%s", path, name)
+                return folder / name
+    shipped = sorted({found.name for folder in folders for found in folder.glob("train_*.yaml")})
+    raise ConfigError(f"no training config at {path}; shipped are {', '.join(shipped)}")
+
+
+def config_folders(module: Path) -> list[Path]:
+    """Where configs are shipped: config/ of a checkout, share/dyfn_ros/config of an installation.
+
+    Args:
+        module: A module of this package, whose place tells either.
+
+    Returns:
+        The folders that exist, the nearest first.
+    """
+    places = (p / name for p in module.parents for name in ("config", "share/dyfn_ros/config"))
+    return [place for place in places if (place / "train_base_mini.yaml").is_file()]
+
+
+def override(values: dict[str, Any], setting: str) -> None:
+    """Put `key=value` or `key.sub=value` on top of settings. Raises ConfigError."""
+    key, found, text = setting.partition("=")
     if not found or not key:
-        raise ConfigError(f"--set {override!r}: expected key=value")
+        raise ConfigError(f"--set {setting!r}: expected key=value")
     *parents, last = key.split(".")
     for parent in parents:
         values = values.setdefault(parent, {})
         if not isinstance(values, dict):
-            raise ConfigError(f"--set {override!r}: {parent} holds no settings of its own")
+            raise ConfigError(f"--set {setting!r}: {parent} holds no settings of its own")
     try:
         values[last] = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override!r}: the value is no YAML: {error}") from error
+        raise ConfigError(f"--set {setting!r}: the value is no YAML: {error}") from error

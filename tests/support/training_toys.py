@@ -112,21 +112,24 @@ def tiny_base(place: Path) -> MiniModel:
     return model
 
 
-def tiny_stabilizer_settings(place: Path) -> dict[str, Any]:
-    """Settings of `dyfn-train stabilizer` for tiny_base, with rendered clips made in data/."""
+def tiny_dyfn_settings(place: Path) -> dict[str, Any]:
+    """Settings of `dyfn-train dyfn` for tiny_base, unrolled; with rendered clips made in data/."""
     write_shard(place / "data", "a_1", "clip", "train", 8, seed=2)
     write_shard(place / "data", "b_1", "clip", "held_out", 5, seed=4)
     return {
         "base": str(place / "base.safetensors"),
         "data": [str(place / "data")],
         "stages": [{"from_step": 0, "batch": 1, "sizes": [[32, 64]]}],
-        "stabilizer": {"hidden": 4, "pool": 2, "form": "residual"},
-        "cache_draws": 1,
-        "cache_length": 4,
-        "length": 3,
-        "decoded": 2,
-        "clips": 1,
-        "strides": [1, 2],
+        "dyfn": {"hidden": 4, "pool": 2, "form": "residual"},
+        "method": {
+            "kind": "unrolled",
+            "cache_draws": 1,
+            "cache_length": 4,
+            "length": 3,
+            "clips": 1,
+            "strides": [1, 2],
+            "objective": {"kind": "terms", "decoded": 2},
+        },
         "steps": 2,
         "threads": 1,
         "device": "cpu",

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dyfn_core.models.checkpoints import save_model
 from dyfn_core.training.config import RunConfig
+from dyfn_core.training.former_config import former_command, translated
 from dyfn_core.training.loop.checkpoint import (
     STATE_FILE,
     DamagedCheckpointError,
@@ -296,6 +297,12 @@ class Trainer:
 
     def _tell_changes(self, before: dict[str, Any]) -> None:
         now = self.config.model_dump(mode="json")
+        if (former := former_command(before)) is not None:
+            before = (
+                type(self.config)
+                .model_validate(translated(before, former, tell=False))
+                .model_dump(mode="json")
+            )
         for name in sorted({*now, *before}):
             if now.get(name) != before.get(name):
                 old, new = before.get(name), now.get(name)

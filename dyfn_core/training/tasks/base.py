@@ -176,7 +176,7 @@ def freeze_encoder(encoder: EfficientNetLite0, blocks: int, depthwise: bool) -> 
             block.depthwise.requires_grad_(False)
 
 
-def validation_examples(config: RunConfig, source: ClipSource) -> dict[str, list[Example]]:
+def validation_examples(config: BaseRunConfig, source: ClipSource) -> dict[str, list[Example]]:
     """Frames to validate on: "rendered", and "recorded" when the config names a recording."""
     try:
         pool = find_sequences(source, "held_out")

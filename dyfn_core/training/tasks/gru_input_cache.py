@@ -1,4 +1,4 @@
-"""What DyFN's recurrence needs of a clip, and no more: summaries of latents, errors, samples.
+"""What DyFN's recurrence needs of a clip, and no more: its inputs, scale errors, samples of depth.
 
 With a frozen base, everything that decides a frame's scale is known before DyFN runs: the latent,
 the base's own depth and its scale error, and how that error moves with the latent's statistics. A
@@ -23,18 +23,25 @@ from dyfn_core.training.tasks.latent_cache import CacheFolder, encode_clips, fin
 
 FEWEST_PIXELS = 64  # frames with fewer valid ones have no scale error
 TOGETHER = 8  # frames whose decoder is differentiated at once
+FORMER = {"summary": "gru_input"}  # names in the files of an earlier version
+FORMER_CONTENTS = {"contents": ["summary", "error", "depth", "truth", "slope"]}
 GRID = (6, 8)  # samples of a frame's depth, evenly spread
 
 
 @dataclass(frozen=True)
 class GRUInputClips:
-    """B clips of T frames. summary: B x T x C (x h x w) float16, as Stabilizer.summarise gives it.
-    error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any. depth,
-    truth: B x T x N, the base's z and the true one (NaN where unknown) at the same N pixels. slope:
-    B x T x 2C float16, derivative of a frame's error by DyFN's residual gamma and beta: its
-    direction is nearly the same everywhere, its length is not."""
+    """B clips of T frames.
 
-    summary: Tensor
+    Attributes:
+        gru_input: B x T x C (x h x w) float16, as DyFN.gru_input gives it.
+        error: B x T, mean of log z - log(z* / focal) over the valid pixels, NaN without any.
+        depth: B x T x N, the base's z at N pixels.
+        truth: B x T x N, the true z at the same pixels, NaN where unknown.
+        slope: B x T x 2C float16, derivative of a frame's error by DyFN's residual gamma and beta:
+            its direction is nearly the same everywhere, its length is not.
+    """
+
+    gru_input: Tensor
     error: Tensor
     depth: Tensor
     truth: Tensor
@@ -64,27 +71,35 @@ class GRUInputCache:
         wanted = fingerprint(model, source)
         wanted["recurrence"] = [model.stabilizer.config.kind, model.stabilizer.config.pool]
         wanted["contents"] = [field.name for field in fields(GRUInputClips)]
-        files = CacheFolder(folder, draws, wanted, "summaries")
+        files = CacheFolder(folder, draws, wanted, "GRU inputs", FORMER_CONTENTS)
         files.build(source, partial(gru_inputs, model), unreadable)
-        parts = files.load()
-        self.summary = torch.cat([part["summary"] for part in parts])
-        self.error, self.depth, self.truth, self.slope = (
-            torch.cat([part[name] for part in parts])
-            for name in ("error", "depth", "truth", "slope")
+        parts = [_renamed(part) for part in files.load()]
+        self.clips = GRUInputClips(
+            *(torch.cat([part[name] for part in parts]) for name in wanted["contents"])
         )
 
     def usual(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of every channel over all clips."""
-        channels = self.summary.transpose(0, 2).flatten(1).float()
+        """Mean and standard deviation of every channel of the input over all clips, C each."""
+        channels = self.clips.gru_input.transpose(0, 2).flatten(1).float()
         return channels.mean(1), channels.std(1).clamp(min=1e-6)
 
     def batches(
         self, start: int, seed: int, clips: int, length: int, strides: tuple[int, int]
     ) -> Iterator[GRUInputClips]:
-        """Endless batches, on the CPU: `length` frames, strides[0]..strides[1] apart, also
-        backwards."""
+        """Draw endless batches, on the CPU.
+
+        Args:
+            start: Step of the first batch.
+            seed: Of the draws.
+            clips: Clips of a batch.
+            length: Frames of a clip, in order or backwards.
+            strides: Least and greatest distance of the frames.
+
+        Yields:
+            A batch.
+        """
         step = start
-        frames = self.summary.shape[1]
+        frames = self.clips.gru_input.shape[1]
         longest = min(strides[1], (frames - 1) // (length - 1))
         while True:
             draw = torch.Generator().manual_seed(seed * 1_000_003 + step)
@@ -98,28 +113,32 @@ class GRUInputCache:
         def below(limit: int) -> int:
             return int(torch.randint(limit, (1,), generator=draw))
 
-        clip, frames = below(len(self.summary)), self.summary.shape[1]
+        clip, frames = below(len(self.clips.gru_input)), self.clips.gru_input.shape[1]
         stride = strides[0] + below(strides[1] - strides[0] + 1)
         index = below(frames - (length - 1) * stride) + stride * torch.arange(length)
         if below(2):
             index = index.flip(0)
-        parts = (self.summary, self.error, self.depth, self.truth, self.slope)
-        return tuple(part[clip, index] for part in parts)
+        return tuple(getattr(self.clips, field.name)[clip, index] for field in fields(self.clips))
+
+
+def _renamed(part: dict[str, Tensor]) -> dict[str, Tensor]:
+    """What a file of an earlier version calls summary is the GRU's input."""
+    return {FORMER.get(name, name): value for name, value in part.items()}
 
 
 def gru_inputs(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
     """The parts of GRUInputClips."""
-    stabilizer = model.stabilizer
-    assert stabilizer is not None
+    dyfn = model.stabilizer
+    assert dyfn is not None
     clips = encode_clips(model, batch)
     aspect = clips.image_size[1] / clips.image_size[0]
     half = (clips.image_size[0] // 2, clips.image_size[1] // 2)
-    summaries, errors, slopes, depths, truths = [], [], [], [], []
+    inputs, errors, slopes, depths, truths = [], [], [], [], []
     for latent, depth, intrinsics in zip(
         clips.latent.float(), clips.depth.float(), batch.intrinsics, strict=True
     ):
         with torch.no_grad():
-            summaries.append(stabilizer.summarise(latent, latent.mean((-2, -1))).half())
+            inputs.append(dyfn.gru_input(latent, latent.mean((-2, -1))).half())
             z = decoded_z(model, Latent(latent, half, clips.network_size))
             level = mean_log(z, depth)
         focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / (aspect**2 + 1) ** 0.5
@@ -135,7 +154,7 @@ def gru_inputs(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
         ]
         slopes.append(torch.cat(slope).half())
     return {
-        "summary": torch.stack(summaries).contiguous(),
+        "gru_input": torch.stack(inputs).contiguous(),
         "error": torch.stack(errors),
         "depth": torch.stack(depths),
         "truth": torch.stack(truths),

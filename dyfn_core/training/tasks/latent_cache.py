@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -61,9 +61,17 @@ class CacheFolder:
     The folder says what it was made with (wanted); a folder made with something else is an error,
     not a surprise. An interrupted build goes on where it stopped; one that made no file, such as
     one of data that could not be opened, binds nobody. holds: what the files are, for messages.
+    former: what an earlier version wrote for the same, by key of wanted.
     """
 
-    def __init__(self, folder: Path, draws: int, wanted: dict[str, Any], holds: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        draws: int,
+        wanted: dict[str, Any],
+        holds: str,
+        former: Mapping[str, Any] | None = None,
+    ) -> None:
         self.folder, self.draws, self.holds = folder, draws, holds
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / META
@@ -73,7 +81,12 @@ class CacheFolder:
             found = dict(json.loads(path.read_text()))
         except (OSError, ValueError) as error:
             raise ConfigError(f"{path} does not tell how {holds} were made: {error}") from error
-        other = sorted(key for key in wanted if found.get(key) != wanted[key])
+        also = former or {}
+        other = sorted(
+            key
+            for key in wanted
+            if found.get(key) != wanted[key] and (key not in also or found.get(key) != also[key])
+        )
         if other:
             raise ConfigError(
                 f"{folder} holds {holds} made with another {', '.join(other)}: "

@@ -17,8 +17,9 @@ from dyfn_core.experiments.report import ArmScores, trained_table, verdicts, wri
 from dyfn_core.models.base import Latent
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.scoring.variants import VariantScore
-from dyfn_core.training.config import StabilizerRunConfig, read_config
-from tests.support.training_toys import tiny_base, tiny_stabilizer_settings
+from dyfn_core.training.config import read_config
+from dyfn_core.training.dyfn_config import DyFNRunConfig
+from tests.support.training_toys import tiny_base, tiny_dyfn_settings
 
 CONFIG = Path(__file__).resolve().parents[3] / "config" / "train_experiments.yaml"
 
@@ -36,7 +37,7 @@ def base(place: Path) -> MiniModel:
 @pytest.fixture(scope="module")
 def folder(base: MiniModel, place: Path) -> Path:
     """base.safetensors, data/ and config.yaml."""
-    settings = yaml.safe_load(CONFIG.read_text()) | tiny_stabilizer_settings(place)
+    settings = yaml.safe_load(CONFIG.read_text()) | tiny_dyfn_settings(place)
     (place / "config.yaml").write_text(yaml.safe_dump(settings))
     return place
 
@@ -75,7 +76,7 @@ def test_seeds_share_the_cache_and_differ_in_their_runs(folder: Path) -> None:
     (arm,) = {path.parent for path in (folder / "out" / "runs").glob("*/seed_*")} & {
         path.parents[1]
         for path in (folder / "out" / "runs").glob("*/seed_0/config.yaml")
-        if yaml.safe_load(path.read_text())["stabilizer"].get("kind", "convgru") == "convgru"
+        if yaml.safe_load(path.read_text())["dyfn"].get("kind", "convgru") == "convgru"
     }
     losses = [
         json.loads((arm / f"seed_{seed}" / "results.json").read_text())["score"] for seed in (0, 1)
@@ -122,7 +123,7 @@ def test_every_declared_arm_fits_the_config_of_the_repo() -> None:
     for experiment in EXPERIMENTS:
         for arm in experiment.arms:
             sets = [f"{key}={json.dumps(value)}" for key, value in arm.overrides.items()]
-            config = read_config(CONFIG, StabilizerRunConfig, sets)
+            config = read_config(CONFIG, DyFNRunConfig, sets)
             for key, value in arm.overrides.items():
                 at = config.model_dump()
                 for part in key.split("."):

@@ -1,4 +1,4 @@
-"""`dyfn-train stabilizer` on every family: only DyFN changes, and its error is really followed."""
+"""`dyfn-train dyfn` on every family: only DyFN changes, and its error is really followed."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from dyfn_core.models.mini import MiniConfig, MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
 from tests.support.made_frames import write_data_set
 
-RUN = {
+RUN: dict[str, Any] = {
     "kinds": ["clip"],
     "stages": [{"from_step": 0, "batch": 1, "sizes": [[32, 64]]}],
-    "stabilizer": {"kind": "convgru", "hidden": 8},
-    "cache_draws": 2,
-    "cache_length": 4,
-    "strides": [1, 1],
-    "clips": 1,
-    "length": 4,
-    "decoded": 3,
-    "windows": [1, 2],
+    "dyfn": {"kind": "convgru", "hidden": 8},
+    "method": {
+        "kind": "unrolled",
+        "cache_draws": 2,
+        "cache_length": 4,
+        "strides": [1, 1],
+        "clips": 1,
+        "length": 4,
+    },
     "steps": 3,
     "threads": 1,
     "log_every": 1,
@@ -63,19 +64,21 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_data_set(tmp_path_factory.mktemp("data"))
 
 
-def train(folder: Path, data: Path, family: str, **changes: object) -> list[dict[str, Any]]:
+def train(folder: Path, data: Path, family: str, objective: dict[str, Any]) -> list[dict[str, Any]]:
     base = folder / "base.safetensors"
     save_model(tiny(family), base)
     config = folder / "config.yaml"
-    settings = {**RUN, "data": [str(data)], "base": str(base), **changes}
+    settings = {**RUN, "data": [str(data)], "base": str(base)}
+    settings["method"] = {**settings["method"], "objective": objective}
     config.write_text(yaml.safe_dump(settings))
-    assert main(["stabilizer", str(config), "--out", str(folder / "run")]) == 0
+    assert main(["dyfn", str(config), "--out", str(folder / "run")]) == 0
     return [json.loads(line) for line in (folder / "run" / "log.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.parametrize("family", ["mini", "moge", "dav2"])
 def test_base_is_trained_on_and_stays_as_it_was(data: Path, family: str, tmp_path: Path) -> None:
-    log = train(tmp_path, data, family)
+    kind = "disparity" if family == "dav2" else "terms"
+    log = train(tmp_path, data, family, {"kind": kind, "decoded": 3, "windows": [1, 2]})
     before = tiny(family).state_dict()
     trained = load_model(tmp_path / "run" / "model.safetensors")
     after = trained.state_dict()
@@ -96,8 +99,8 @@ def test_base_is_trained_on_and_stays_as_it_was(data: Path, family: str, tmp_pat
 
 def test_the_whole_objective_can_train_it(data: Path, tmp_path: Path) -> None:
     level = {"alpha": 0.5, "anchors": 4, "resolution": 4}
-    objective = {"levels": [level], "resolution": 6, "windows": [1, 2], "edge": 0.1}
-    log = train(tmp_path, data, "mini", objective=objective)
+    objective = {"kind": "paper", "levels": [level], "resolution": 6, "windows": [1, 2]}
+    log = train(tmp_path, data, "mini", {**objective, "edge": 0.1})
     step = next(line for line in log if line["group"] == "train")
     assert {"align_first", "frame", "local_0", "normal", "mask", "edge", "temporal"} <= set(step)
 
@@ -107,7 +110,42 @@ def test_unknown_key_of_the_objective_names_the_nearest(
 ) -> None:
     save_model(tiny("mini"), tmp_path / "base.safetensors")
     config = tmp_path / "config.yaml"
-    wrong = {"objective": {"temporl": 1.0}, "base": str(tmp_path / "base.safetensors")}
+    method = {**RUN["method"], "objective": {"kind": "paper", "temporl": 1.0}}
+    wrong = {"method": method, "base": str(tmp_path / "base.safetensors")}
     config.write_text(yaml.safe_dump({**RUN, "data": [str(data)], **wrong}))
-    assert main(["stabilizer", str(config), "--out", str(tmp_path / "run")]) != 0
-    assert "temporl" in capsys.readouterr().err
+    assert main(["dyfn", str(config), "--out", str(tmp_path / "run")]) != 0
+    assert "unknown key 'temporl', did you mean 'temporal'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("family", "kind", "mended"),
+    [
+        (
+            "dav2",
+            "terms",
+            "{kind: disparity, decoded: 8, windows: [1, 2], temporal_weight: 0.3}",
+        ),
+        ("dav2", "paper", "{kind: disparity}"),
+        (
+            "mini",
+            "disparity",
+            "{kind: terms, decoded: 8, windows: [1, 2], temporal_weight: 0.3}",
+        ),
+    ],
+)
+def test_objective_for_another_output_is_refused_with_what_mends_it(
+    family: str,
+    kind: str,
+    mended: str,
+    data: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    save_model(tiny(family), tmp_path / "base.safetensors")
+    own = {} if kind == "paper" else {"windows": [1, 2], "temporal_weight": 0.3}
+    method = {**RUN["method"], "objective": {"kind": kind, **own}}
+    config = tmp_path / "config.yaml"
+    values = {"method": method, "base": str(tmp_path / "base.safetensors"), "data": [str(data)]}
+    config.write_text(yaml.safe_dump({**RUN, **values}))
+    assert main(["dyfn", str(config), "--out", str(tmp_path / "run")]) == 1
+    assert f"set method.objective to {mended}" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""DyFN from the base's own scale errors: what is summarised, and what training changes."""
+"""DyFN from the base's own scale errors: what the recurrence is given, what training changes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
 from dyfn_core.models.base import AffinePoints, Latent
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.training.config import ConfigError, ScaleRunConfig, read_config
+from dyfn_core.training.config import ConfigError, read_config
+from dyfn_core.training.dyfn_config import DyFNRunConfig
 from dyfn_core.training.loop.run_folder import read_log
-from dyfn_core.training.tasks.dyfn_linearized import ScaleTask
+from dyfn_core.training.tasks.dyfn_linearized import LinearizedTask
 from dyfn_core.training.tasks.gru_input_cache import (
     decoded_z,
     gru_inputs,
@@ -24,7 +25,7 @@ from dyfn_core.training.tasks.gru_input_cache import (
     scale_slope,
 )
 from dyfn_core.training.tasks.latent_cache import encode_clips
-from tests.support.training_toys import tiny_base, tiny_stabilizer_settings
+from tests.support.training_toys import tiny_base, tiny_dyfn_settings
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +33,20 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """base.safetensors, data/ and config.yaml."""
     folder = tmp_path_factory.mktemp("scale")
     tiny_base(folder)
-    settings = tiny_stabilizer_settings(folder)
-    del settings["cache_draws"], settings["decoded"]
-    recurrence = {"hidden": 4, "pool": 2, "form": "residual", "standardize": True}
-    settings |= {"summary_draws": 2, "strides": [1, 1], "stabilizer": recurrence, "log_every": 1}
+    settings = tiny_dyfn_settings(folder)
+    clips = {name: settings["method"][name] for name in ("cache_length", "length", "clips")}
+    settings["method"] = {"kind": "linearized", "gru_input_draws": 2, **clips}
+    settings["dyfn"] |= {"standardize": True}
+    settings["log_every"] = 1
     (folder / "config.yaml").write_text(yaml.safe_dump(settings))
     return folder
 
 
-def task(place: Path, cache: Path, *overrides: str) -> ScaleTask:
-    return ScaleTask(read_config(place / "config.yaml", ScaleRunConfig, list(overrides)), cache)
+def task(place: Path, cache: Path, *overrides: str) -> LinearizedTask:
+    return LinearizedTask(read_config(place / "config.yaml", DyFNRunConfig, list(overrides)), cache)
 
 
-def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Path) -> None:
+def test_gru_inputs_hold_the_scale_error_of_every_frame(place: Path, tmp_path: Path) -> None:
     made = task(place, tmp_path)
     batch = draw_batch(made.source, find_sequences(made.source, "train"), 0)
     parts = gru_inputs(made.model, batch)
@@ -58,7 +60,7 @@ def test_summary_holds_the_scale_error_of_every_frame(place: Path, tmp_path: Pat
     focal = 0.5 * (fx * 64 + fy * 32) / math.hypot(64, 32)
     wanted = (z[known].log() - (true[known] / focal).log()).mean()
     torch.testing.assert_close(parts["error"][0, 2], wanted, rtol=1e-4, atol=1e-4)
-    assert parts["summary"].shape == (1, 4, 8, 2, 4)
+    assert parts["gru_input"].shape == (1, 4, 8, 2, 4)
 
 
 def test_samples_pair_the_bases_depth_with_the_true_one(place: Path, tmp_path: Path) -> None:
@@ -96,7 +98,11 @@ def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path:
 
 
 def test_training_lowers_the_spread_of_the_scales(place: Path, tmp_path: Path) -> None:
-    made = task(place, tmp_path, "noise=0", "length=4", "clips=2", "change_weight=0")
+    made = task(
+        place,
+        tmp_path,
+        *(f"method.{text}" for text in ("noise=0", "length=4", "clips=2", "change_weight=0")),
+    )
     batch = next(iter(made.batches(0)))
     optimizer = torch.optim.Adam(made.groups()[0]["params"], lr=0.05)
     spreads = []
@@ -114,7 +120,7 @@ def test_command_trains_dyfn_alone_and_keeps_the_usual_statistics(
     place: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    assert main(["scale", str(place / "config.yaml"), "--out", str(out)]) == 0
+    assert main(["dyfn", str(place / "config.yaml"), "--out", str(out)]) == 0
     base, trained = load_model(place / "base.safetensors"), load_model(out / "model.safetensors")
     assert trained.stabilizer is not None
     for name, value in base.state_dict().items():
@@ -126,13 +132,13 @@ def test_command_trains_dyfn_alone_and_keeps_the_usual_statistics(
 
 def test_the_papers_form_has_no_corrections_to_learn(place: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="'residual', got 'paper'"):
-        task(place, tmp_path, "stabilizer.form=paper")
+        task(place, tmp_path, "dyfn.form=paper")
 
 
-def test_summaries_of_another_recurrence_are_refused(place: Path, tmp_path: Path) -> None:
+def test_gru_inputs_of_another_recurrence_are_refused(place: Path, tmp_path: Path) -> None:
     task(place, tmp_path)
     with pytest.raises(ConfigError, match="recurrence"):
-        task(place, tmp_path, "stabilizer.pool=1")
+        task(place, tmp_path, "dyfn.pool=1")
 
 
 def test_validation_scores_the_frozen_base_once(
@@ -141,9 +147,9 @@ def test_validation_scores_the_frozen_base_once(
     made = task(place, tmp_path)
     assert made.model.stabilizer is not None
     decoded: list[int] = []
-    decode = ScaleTask._decode
+    decode = LinearizedTask.decode
     monkeypatch.setattr(
-        ScaleTask, "_decode", lambda self, *given: decoded.append(1) or decode(self, *given)
+        LinearizedTask, "decode", lambda self, *given: decoded.append(1) or decode(self, *given)
     )
     with torch.no_grad():
         first, frames = made.validate(), len(decoded)

@@ -22,20 +22,20 @@ from dyfn_core.data.clips import draw_batch, find_sequences
 from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
-    StabilizerRunConfig,
     read_config,
 )
+from dyfn_core.training.dyfn_config import DyFNRunConfig
 from dyfn_core.training.loop.checkpoint import read_state
 from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.scaling_curve import images_at, last_doubling
-from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 from dyfn_core.training.tasks.latent_cache import encode_clips
 from tests.support.made_frames import write_shard
 from tests.support.training_toys import (
     PATIENCE,
     environment,
     tiny_base,
-    tiny_stabilizer_settings,
+    tiny_dyfn_settings,
     wait_for_step,
 )
 
@@ -43,26 +43,22 @@ from tests.support.training_toys import (
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """base.safetensors, data/ and config.yaml."""
-    folder = tmp_path_factory.mktemp("stabilizer")
+    folder = tmp_path_factory.mktemp("dyfn")
     tiny_base(folder)
-    settings = tiny_stabilizer_settings(folder) | {
-        "stabilizer": {"hidden": 4, "pool": 2, "form": "residual"},
-        "length": 4,
-        "decoded": 4,
-        "log_every": 1,
-    }
+    settings = tiny_dyfn_settings(folder) | {"log_every": 1}
+    settings["method"] |= {"length": 4, "objective": {"kind": "terms", "decoded": 4}}
     (folder / "config.yaml").write_text(yaml.safe_dump(settings))
     return folder
 
 
-def settings(place: Path, *overrides: str) -> StabilizerRunConfig:
-    return read_config(place / "config.yaml", StabilizerRunConfig, list(overrides))
+def settings(place: Path, *overrides: str) -> DyFNRunConfig:
+    return read_config(place / "config.yaml", DyFNRunConfig, list(overrides))
 
 
 @pytest.fixture
-def task(place: Path) -> StabilizerTask:
+def task(place: Path) -> UnrolledTask:
     """With heads that do something, so that the gradient reaches every parameter."""
-    task = StabilizerTask(settings(place), place / "latents")
+    task = UnrolledTask(settings(place), place / "latents")
     torch.manual_seed(5)
     assert task.model.stabilizer is not None
     for head in (task.model.stabilizer.gamma_head, task.model.stabilizer.beta_head):
@@ -70,7 +66,7 @@ def task(place: Path) -> StabilizerTask:
     return task
 
 
-def gradients(task: StabilizerTask, batch: object) -> torch.Tensor:
+def gradients(task: UnrolledTask, batch: object) -> torch.Tensor:
     """DyFN's gradient as one vector."""
     task.model.zero_grad(set_to_none=True)
     torch.manual_seed(11)
@@ -79,7 +75,7 @@ def gradients(task: StabilizerTask, batch: object) -> torch.Tensor:
     return torch.cat([p.grad.flatten() for p in task.model.stabilizer.parameters()])  # type: ignore[union-attr]
 
 
-def test_only_dyfn_has_gradients(task: StabilizerTask) -> None:
+def test_only_dyfn_has_gradients(task: UnrolledTask) -> None:
     gradients(task, next(task.batches(0)))
     for name, parameter in task.model.named_parameters():
         assert (parameter.grad is not None) == name.startswith("stabilizer.")
@@ -88,7 +84,7 @@ def test_only_dyfn_has_gradients(task: StabilizerTask) -> None:
     assert trained == {id(p) for p in task.model.parameters() if p.requires_grad}
 
 
-def test_gradients_agree_with_those_without_a_cache(task: StabilizerTask) -> None:
+def test_gradients_agree_with_those_without_a_cache(task: UnrolledTask) -> None:
     assert task.cache is not None
     cached = task.cache.entries[0]
     images = draw_batch(task.source, find_sequences(task.source, "train"), 0)
@@ -108,8 +104,8 @@ def test_gradients_agree_with_those_without_a_cache(task: StabilizerTask) -> Non
 
 def test_run_without_a_cache_encodes_clips_of_its_own(place: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    config = [str(place / "config.yaml"), "--out", str(out), "--set", "cache_draws=0"]
-    assert main(["stabilizer", *config]) == 0
+    config = [str(place / "config.yaml"), "--out", str(out), "--set", "method.cache_draws=0"]
+    assert main(["dyfn", *config]) == 0
     lines = [line for line in read_log(out / "log.jsonl") if line["group"] == "train"]
     assert [line["images"] for line in lines] == [4, 8]
     assert not (out / "latents").exists()
@@ -118,8 +114,13 @@ def test_run_without_a_cache_encodes_clips_of_its_own(place: Path, tmp_path: Pat
 def test_signal_to_the_whole_process_group_leaves_a_checkpoint(place: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     config = [str(place / "config.yaml"), "--out", str(out)]
-    sets = ["cache_draws=0", "steps=1000000", "checkpoint_minutes=1000", "validate_every=10000000"]
-    command = [sys.executable, "-m", "dyfn_core.cli.train", "stabilizer", *config]
+    sets = [
+        "method.cache_draws=0",
+        "steps=1000000",
+        "checkpoint_minutes=1000",
+        "validate_every=10000000",
+    ]
+    command = [sys.executable, "-m", "dyfn_core.cli.train", "dyfn", *config]
     command += [word for setting in sets for word in ("--set", setting)]
     process = subprocess.Popen(
         command, env=environment(), stderr=subprocess.PIPE, start_new_session=True
@@ -132,16 +133,16 @@ def test_signal_to_the_whole_process_group_leaves_a_checkpoint(place: Path, tmp_
     assert read_state(out)["step"] == read_log(out / "log.jsonl")[-1]["step"]
 
 
-def test_losses_are_float32_under_mixed_precision(task: StabilizerTask) -> None:
+def test_losses_are_float32_under_mixed_precision(task: UnrolledTask) -> None:
     batch = next(task.batches(0))
     seen = []
-    terms = task._point_terms
+    terms = task._terms
 
-    def watched(points, target, frames):  # type: ignore[no-untyped-def]
-        seen.append((points.dtype, torch.is_autocast_enabled("cpu")))
-        return terms(points, target, frames)
+    def watched(affine, target, frames):  # type: ignore[no-untyped-def]
+        seen.append((affine.points.dtype, torch.is_autocast_enabled("cpu")))
+        return terms(affine, target, frames)
 
-    task._point_terms = watched  # type: ignore[method-assign]
+    task._terms = watched  # type: ignore[method-assign]
     torch.manual_seed(11)
     exact = float(task.loss(batch)[0])
     torch.manual_seed(11)
@@ -159,11 +160,11 @@ def test_losses_are_float32_under_mixed_precision(task: StabilizerTask) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("stabilizer.hiden=3", "unknown key 'hiden', did you mean 'hidden'"),
-        ("stabilizer.hidden=many", "hidden: .*integer"),
-        ("stabilizer.form=papre", "form 'papre' is unknown, expected one of"),
+        ("dyfn.hiden=3", "unknown key 'hiden', did you mean 'hidden'"),
+        ("dyfn.hidden=many", "hidden: .*integer"),
+        ("dyfn.form=papre", "form 'papre' is unknown, expected one of"),
         ("hidden=3", "unknown key 'hidden'"),
-        ("stages=[{from_step: 0, bacth: 1, sizes: [[32, 64]]}]", "did you mean 'batch'"),
+        ("stages=[{from_step: 0, bacth: 1, sizes: [[32, 64]]}]", "did you mean 'stages.0.batch'"),
         ("from_step=3", "unknown key 'from_step', did you mean 'stages.from_step'"),
         ("mixed_precision=bf61", "mixed_precision"),
     ],
@@ -243,11 +244,11 @@ def test_validation_on_what_is_trained_on_is_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     tiny_base(tmp_path)
-    values = tiny_stabilizer_settings(tmp_path)
+    values = tiny_dyfn_settings(tmp_path)
     shutil.rmtree(tmp_path / "data" / "clips" / "b_1")
-    config = StabilizerRunConfig.model_validate({**values, "steps": 1})
+    config = DyFNRunConfig.model_validate({**values, "steps": 1})
     with torch.no_grad():
-        StabilizerTask(config, tmp_path / "latents").validate()
+        UnrolledTask(config, tmp_path / "latents").validate()
     assert "nothing is held out" in caplog.text
 
 
@@ -264,8 +265,8 @@ def test_clips_that_cannot_be_read_are_counted_also_over_a_resume(
     place: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     data = damaged_copy(place, tmp_path)
-    command = ["stabilizer", str(place / "config.yaml"), "--set", data, "--set", "steps=6"]
-    command += ["--set", "cache_draws=0", "--out"]
+    command = ["dyfn", str(place / "config.yaml"), "--set", data, "--set", "steps=6"]
+    command += ["--set", "method.cache_draws=0", "--out"]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     assert main([*command, str(whole)]) == 0
     counted = json.loads((whole / "results.json").read_text())["unreadable_clips"]
@@ -279,7 +280,7 @@ def test_clips_that_cannot_be_read_are_counted_also_over_a_resume(
 
 def test_a_cache_that_holds_nothing_binds_nobody(place: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = ["stabilizer", str(place / "config.yaml"), "--out", str(out)]
+    command = ["dyfn", str(place / "config.yaml"), "--out", str(out)]
     data = damaged_copy(place, tmp_path)
     shutil.rmtree(tmp_path / "data" / "clips" / "a_1")
     assert main([*command, "--set", data]) == 1
@@ -291,7 +292,7 @@ def test_a_resume_of_nothing_is_refused_before_anything_is_made(
     place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert main(["stabilizer", str(place / "config.yaml"), "--out", str(out), "--resume"]) == 1
+    assert main(["dyfn", str(place / "config.yaml"), "--out", str(out), "--resume"]) == 1
     assert f"nothing to resume: {out} holds no state.pt" in capsys.readouterr().err
     assert not out.exists()
 
@@ -301,7 +302,7 @@ def test_a_recording_in_the_place_of_the_config_is_named(
 ) -> None:
     recording = tmp_path / "run.mcap"
     recording.write_bytes(bytes([0x89, 0x4D, 0xFF, 0xFE]))
-    assert main(["stabilizer", str(recording), "--out", str(tmp_path / "out")]) == 1
+    assert main(["dyfn", str(recording), "--out", str(tmp_path / "out")]) == 1
     told = capsys.readouterr().err
     assert f"{recording} is no readable YAML file of settings (data are given with --data)" in told
 
@@ -310,7 +311,7 @@ def test_a_recording_in_the_place_of_the_config_is_named(
 def test_steps_are_at_least_one(
     steps: str, place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["stabilizer", str(place / "config.yaml"), "--out", str(tmp_path / "out")]
+    command = ["dyfn", str(place / "config.yaml"), "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit):
         main([*command, "--max-steps", steps])
     assert "--max-steps: expected a whole number of 1 or more" in capsys.readouterr().err

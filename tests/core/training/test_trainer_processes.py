@@ -31,7 +31,7 @@ from tests.support.training_toys import (
     environment,
     run_toy,
     tiny_base,
-    tiny_stabilizer_settings,
+    tiny_dyfn_settings,
     toy_config,
 )
 
@@ -115,9 +115,10 @@ def test_parts_that_cannot_be_shared_out_are_refused() -> None:
 
 def test_processes_make_a_cache_together(tmp_path: Path) -> None:
     tiny_base(tmp_path)
-    settings = tiny_stabilizer_settings(tmp_path) | {"cache_draws": 5, "clips": 2}
+    settings = tiny_dyfn_settings(tmp_path)
+    settings["method"] |= {"cache_draws": 5, "clips": 2}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
-    command = ["stabilizer", str(tmp_path / "config.yaml"), "--out"]
+    command = ["dyfn", str(tmp_path / "config.yaml"), "--out"]
     run_two(["-m", "dyfn_core.cli.train", *command, str(tmp_path / "two")])
     assert train.main([*command, str(tmp_path / "one")]) == 0
     files = {path.name: path for path in (tmp_path / "one" / "latents").iterdir()}

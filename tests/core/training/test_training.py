@@ -15,15 +15,16 @@ from dyfn_core.models.mini import MiniModel
 from dyfn_core.training.config import (
     BaseRunConfig,
     ConfigError,
-    StabilizerRunConfig,
+    RunConfig,
+    config_folders,
     read_config,
 )
+from dyfn_core.training.dyfn_config import DyFNRunConfig
 from dyfn_core.training.loop.trainer import Trainer, TrainingError
 from dyfn_core.training.tasks.base import BaseTask
-from dyfn_core.training.tasks.dyfn_unrolled import StabilizerTask
+from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 from tests.support.made_frames import write_data_set
 
-CONFIGS = Path(__file__).resolve().parents[3] / "config"
 TINY = {
     "model": {"latent_channels": 16, "stage_channels": [16, 8], "context_channels": 24},
     "stages": [{"from_step": 0, "batch": 2, "sizes": [[32, 64]]}],
@@ -35,6 +36,7 @@ TINY = {
     "validation_frames": 2,
     "warmup_steps": 2,
 }
+BASE_ALONE = ("model", "validation_frames")
 
 
 @pytest.fixture(scope="module")
@@ -115,30 +117,33 @@ def test_frozen_encoder_parts_keep_their_imagenet_weights(base_run: Path) -> Non
     assert not torch.equal(before["blocks.9.project.weight"], after["blocks.9.project.weight"])
 
 
-STABILIZER = {
+DYFN = {
     "stages": [{"from_step": 0, "batch": 2, "sizes": [[32, 64], [64, 32]]}],
-    "stabilizer": {"kind": "convgru", "form": "residual", "hidden": 8, "pool": 2},
-    "cache_draws": 3,
-    "cache_length": 5,
-    "strides": [1, 2],
-    "clips": 2,
-    "length": 3,
-    "decoded": 3,
+    "dyfn": {"kind": "convgru", "form": "residual", "hidden": 8, "pool": 2},
+    "method": {
+        "kind": "unrolled",
+        "cache_draws": 3,
+        "cache_length": 5,
+        "strides": [1, 2],
+        "clips": 2,
+        "length": 3,
+        "objective": {"kind": "terms", "decoded": 3},
+    },
     "validation_clips": 2,
 }
 
 
-def stabilizer_config(folder: Path, data: Path, base: Path, **changes: object) -> Path:
-    values = {key: value for key, value in TINY.items() if key != "model"}
+def dyfn_config(folder: Path, data: Path, base: Path, **changes: object) -> Path:
+    values = {key: value for key, value in TINY.items() if key not in BASE_ALONE}
     values |= {"data": [str(data)], "base": str(base / "model.safetensors")}
-    path = folder / "stabilizer.yaml"
-    path.write_text(yaml.safe_dump({**values, **STABILIZER, **changes}))
+    path = folder / "dyfn.yaml"
+    path.write_text(yaml.safe_dump({**values, **DYFN, **changes}))
     return path
 
 
-def test_stabilizer_run_changes_dyfn_alone(data: Path, base_run: Path, tmp_path: Path) -> None:
-    config = stabilizer_config(tmp_path, data, base_run, learning_rate=0.01)
-    assert main(["stabilizer", str(config), "--out", str(tmp_path / "run")]) == 0
+def test_dyfn_run_changes_dyfn_alone(data: Path, base_run: Path, tmp_path: Path) -> None:
+    config = dyfn_config(tmp_path, data, base_run, learning_rate=0.01)
+    assert main(["dyfn", str(config), "--out", str(tmp_path / "run")]) == 0
     model = load_model(tmp_path / "run" / "model.safetensors").state_dict()
     base = load_model(base_run / "model.safetensors").state_dict()
     assert all(torch.equal(model[name], base[name]) for name in base)
@@ -147,25 +152,25 @@ def test_stabilizer_run_changes_dyfn_alone(data: Path, base_run: Path, tmp_path:
     assert {"rendered_base_video", "rendered_dyfn_video"} <= set(validation[0])
 
 
-def test_stabilizer_run_resumes_from_its_cache(data: Path, base_run: Path, tmp_path: Path) -> None:
-    config = str(stabilizer_config(tmp_path, data, base_run))
+def test_dyfn_run_resumes_from_its_cache(data: Path, base_run: Path, tmp_path: Path) -> None:
+    config = str(dyfn_config(tmp_path, data, base_run))
     whole, halves = tmp_path / "whole", tmp_path / "halves"
-    cache = ["--set", f"cache={tmp_path / 'latents'}"]
-    assert main(["stabilizer", config, "--out", str(whole), *cache]) == 0
-    assert main(["stabilizer", config, "--out", str(halves), *cache, "--max-steps", "2"]) == 0
-    assert main(["stabilizer", config, "--out", str(halves), *cache, "--resume"]) == 0
+    cache = ["--set", f"method.cache={tmp_path / 'latents'}"]
+    assert main(["dyfn", config, "--out", str(whole), *cache]) == 0
+    assert main(["dyfn", config, "--out", str(halves), *cache, "--max-steps", "2"]) == 0
+    assert main(["dyfn", config, "--out", str(halves), *cache, "--resume"]) == 0
     losses = [[line["loss"] for line in read_log(out)] for out in (whole, halves)]
     assert losses[0] == losses[1]
 
 
 def test_latents_of_another_model_are_refused(data: Path, base_run: Path, tmp_path: Path) -> None:
     cache = tmp_path / "latents"
-    path = stabilizer_config(tmp_path, data, base_run, cache=str(cache))
-    config = read_config(path, StabilizerRunConfig, [])
-    StabilizerTask(config, tmp_path)
+    path = dyfn_config(tmp_path, data, base_run)
+    config = read_config(path, DyFNRunConfig, [f"method.cache={cache}"])
+    UnrolledTask(config, tmp_path)
     (cache / "cache.json").write_text(json.dumps({"model": "other", "source": {}}))
     with pytest.raises(ConfigError, match="another model, source"):
-        StabilizerTask(config, tmp_path)
+        UnrolledTask(config, tmp_path)
 
 
 def test_run_without_finite_losses_ends_with_the_reason(data: Path, tmp_path: Path) -> None:
@@ -207,9 +212,35 @@ def test_bad_settings_are_named(
         read_config(path, BaseRunConfig, overrides)
 
 
-def test_configs_in_the_repo_are_valid() -> None:
-    read_config(CONFIGS / "train_base_mini.yaml", BaseRunConfig, [])
-    read_config(CONFIGS / "train_stabilizer_mini.yaml", StabilizerRunConfig, [])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("train_base_mini.yaml", BaseRunConfig),
+        ("train_base_mini_more.yaml", BaseRunConfig),
+        ("train_dyfn_mini.yaml", DyFNRunConfig),
+        ("train_dyfn_unrolled_mini.yaml", DyFNRunConfig),
+        ("train_experiments.yaml", DyFNRunConfig),
+    ],
+)
+def test_shipped_configs_are_found_by_name_from_anywhere(
+    name: str, kind: type[RunConfig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = read_config(Path("config") / name, kind, [])
+    assert read_config(Path(name), kind, []) == config
+
+
+def test_configs_are_found_beside_an_installed_package(tmp_path: Path) -> None:
+    installed = tmp_path / "share" / "dyfn_ros" / "config"
+    installed.mkdir(parents=True)
+    (installed / "train_base_mini.yaml").touch()
+    module = tmp_path / "lib" / "python3.12" / "site-packages" / "dyfn_core" / "training" / "c.py"
+    assert config_folders(module) == [installed]
+
+
+def test_a_config_that_is_nowhere_names_the_shipped_ones(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no training config at .*none.yaml; shipped are "):
+        read_config(tmp_path / "none.yaml", BaseRunConfig, [])
 
 
 def test_evaluate_prints_the_controls(

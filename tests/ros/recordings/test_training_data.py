@@ -193,19 +193,19 @@ TINY = {
     "picture_every": 2,
     "validate_every": 2,
     "warmup_steps": 1,
-    "cache_draws": 2,
-    "cache_length": 4,
-    "strides": [1, 2],
-    "clips": 2,
-    "length": 3,
-    "decoded": 3,
-    "windows": [1],
+    "method.cache_draws": 2,
+    "method.cache_length": 4,
+    "method.strides": [1, 2],
+    "method.clips": 2,
+    "method.length": 3,
+    "method.objective.decoded": 3,
+    "method.objective.windows": [1],
     "validation_clips": 1,
 }
 
 
 def test_fine_tuning_on_a_recording_changes_dyfn_alone(tmp_path: Path) -> None:
-    """`dyfn-train stabilizer --data recording.mcap --data folder`, with the default config."""
+    """`dyfn-train dyfn --data recording.mcap --data folder`, with the default config."""
     path = write_recording(tmp_path / "run.mcap", 8)
     folder = tmp_path / "folder"
     for index in range(8):
@@ -218,7 +218,7 @@ def test_fine_tuning_on_a_recording_changes_dyfn_alone(tmp_path: Path) -> None:
         text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
     ]
     data = ["--data", str(path), "--data", str(folder)]
-    assert main(["stabilizer", *data, "--out", str(tmp_path / "out"), *settings]) == 0
+    assert main(["dyfn", *data, "--out", str(tmp_path / "out"), *settings]) == 0
     before = load_model("dyfn-mini").state_dict()
     after = load_model(tmp_path / "out" / "model.safetensors").state_dict()
     changed = {name for name in before if not torch.equal(before[name], after[name])}
@@ -234,7 +234,7 @@ def test_recording_given_with_options_on_the_command_line(
         text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
     ]
     out = tmp_path / "out"
-    command = ["stabilizer", "--out", str(out), *settings, "--data"]
+    command = ["dyfn", "--out", str(out), *settings, "--data"]
     assert main([*command, str(path)]) == 1
     told = capsys.readouterr().err
     assert "8 x image without depth within 0.02 s (`tolerance`)" in told
@@ -255,7 +255,7 @@ def test_a_recording_without_any_valid_depth_is_trained_on_but_not_scored(
         text for key, value in TINY.items() for text in ("--set", f"{key}={json.dumps(value)}")
     ]
     out = tmp_path / "out"
-    assert main(["stabilizer", "--data", str(path), "--out", str(out), *settings]) == 0
+    assert main(["dyfn", "--data", str(path), "--out", str(out), *settings]) == 0
     assert "no depth is known in the validation clips" in caplog.text
     results = json.loads((out / "results.json").read_text())
     assert results["score"] is None
@@ -269,7 +269,7 @@ def test_recording_named_in_a_config_with_options(
     named = {"root": str(path), "kind": "recording", "depth_topik": DEPTH}
     config = tmp_path / "config.yaml"
     config.write_text(yaml.safe_dump({**TINY, "base": "dyfn-mini", "data": [named]}))
-    assert main(["stabilizer", str(config), "--out", str(tmp_path / "out")]) == 1
+    assert main(["dyfn", str(config), "--out", str(tmp_path / "out")]) == 1
     assert (
         "'depth_topik' of kind 'recording', did you mean 'depth_topic'" in capsys.readouterr().err
     )
