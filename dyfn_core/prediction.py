@@ -91,11 +91,14 @@ class StreamState:
         Returns:
             B states of one stream each; the inverse of `stack`.
         """
-        hidden = self.hidden.split(1)
-        none: list[Tensor | None] = [None] * len(hidden)
-        means = none if self.ema_mean is None else list(self.ema_mean.split(1))
-        stds = none if self.ema_std is None else list(self.ema_std.split(1))
-        return [StreamState(*row) for row in zip(hidden, means, stds, strict=True)]
+
+        def row(values: Tensor | None, index: int) -> Tensor | None:
+            return None if values is None else values[index : index + 1]
+
+        return [
+            StreamState(self.hidden[i : i + 1], row(self.ema_mean, i), row(self.ema_std, i))
+            for i in range(len(self.hidden))
+        ]
 
     def to(self, device: torch.device | str) -> StreamState:
         """The same state on another device.

@@ -28,7 +28,7 @@ class CalibrationOptions:
         rate: its fastest change, in log units (0.05: 5%) a second.
     disagreement: log difference beyond which a fit contradicts the scale in force. It is not
         followed; when all fits of `patience` seconds contradict it, "hold" says so until they
-        come back to within half of it, and "track" calibrates anew.
+        come back to within half of it, and "track" calibrates again.
     """
 
     mode: str = "hold"

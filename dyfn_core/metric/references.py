@@ -181,7 +181,8 @@ class ConeReference:
 
 def _keep(points: np.ndarray, good: np.ndarray, reason: str, dropped: Counter[str]) -> np.ndarray:
     dropped[reason] += int((~good).sum())
-    return points[good]
+    kept: np.ndarray = points[good]
+    return kept
 
 
 def _pairs(

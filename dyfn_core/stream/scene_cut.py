@@ -57,8 +57,9 @@ def _colours(small: np.ndarray) -> np.ndarray:
     # Chromaticities of real pictures crowd around a third: the middle half gets all the bins.
     place = np.clip((rgb[:, :2] / total[:, None] - 1 / 6) * 3 * _BINS, 0, _BINS - 1).astype(int)
     index = place[:, 0] * _BINS + place[:, 1]
-    counts = np.bincount(index, total, _BINS * _BINS).astype(np.float32)
-    return counts / counts.sum()
+    counts: np.ndarray = np.bincount(index, total, _BINS * _BINS).astype(np.float32)
+    shares: np.ndarray = counts / counts.sum()
+    return shares
 
 
 def structure_difference(before: PictureFeatures, now: PictureFeatures) -> float:
@@ -96,7 +97,8 @@ def _windows(picture: np.ndarray) -> np.ndarray:
     flat = views.reshape(*views.shape[:3], -1)
     flat = flat - flat.mean(axis=-1, keepdims=True)
     flat = flat.reshape(*flat.shape[:2], -1)
-    return flat / np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-3)
+    unit: np.ndarray = flat / np.maximum(np.linalg.norm(flat, axis=-1, keepdims=True), 1e-3)
+    return unit
 
 
 def _displaced() -> tuple[np.ndarray, np.ndarray, np.ndarray]:

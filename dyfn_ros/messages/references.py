@@ -40,7 +40,8 @@ class Transform:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """N x 3 -> N x 3."""
-        return points @ self.rotation.T + self.translation
+        moved: np.ndarray = points @ self.rotation.T + self.translation
+        return moved
 
 
 def parse_pose(text: str, name: str) -> Transform:

@@ -12,6 +12,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.signals import uninstall_signal_handlers
+from rclpy.utilities import try_shutdown
 
 from dyfn_ros.node.environment import prepare_environment
 from dyfn_ros.node.parameters.declare import usage
@@ -39,7 +40,9 @@ def _autostart(node: StreamDepthNode) -> bool:
     """Configure and activate. -> whether that worked; the node has said why if not."""
     success = TransitionCallbackReturn.SUCCESS
     try:
-        return node.trigger_configure() == success and node.trigger_activate() == success
+        return all(
+            change() == success for change in (node.trigger_configure, node.trigger_activate)
+        )
     except RuntimeError:  # the state machine cannot publish into a context that has ended
         if node.context.ok():
             raise
@@ -80,7 +83,7 @@ def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> 
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     done = node is None or node.close()
-    rclpy.try_shutdown()
+    try_shutdown()
     if not done:  # a download, or a huge model: the interpreter cannot end under a running thread
         sys.stdout.flush()
         sys.stderr.flush()

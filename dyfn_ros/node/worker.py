@@ -59,7 +59,7 @@ class FrameWorker(Generic[T]):
         self._thread.start()
 
     def wait_prepared(self, patience: float) -> bool:
-        """Whether prepare has ended, well or with `error`, within so many seconds."""
+        """Whether prepare has ended, well or with `error`, within `patience` seconds."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self._prepared or self.error is not None, patience

@@ -74,7 +74,7 @@ def test_track_follows_within_its_rate_and_arrives() -> None:
     assert calibrator.state.recalibrations == 0
 
 
-def test_track_calibrates_anew_after_lasting_contradiction_only() -> None:
+def test_track_calibrates_again_after_lasting_contradiction_only() -> None:
     calibrator = ScaleCalibrator(CalibrationOptions("track"))
     play(calibrator, 2.0, 0, 2)
     during = play(calibrator, 6.0, 2, 4.5)

@@ -119,7 +119,7 @@ def primed(rig: Rig) -> Rig:
 
 @pytest.fixture
 def rig(both: Rig) -> Rig:
-    """Both streams start anew with the next frame."""
+    """Both streams reset with the next frame."""
     both.reset()
     return both
 

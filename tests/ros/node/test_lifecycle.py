@@ -130,7 +130,7 @@ def test_the_states_of_a_managed_node(setup: Setup) -> None:
     assert "Traceback" not in node.log
 
 
-def test_a_jump_of_ros_time_starts_the_stream_anew(setup: Setup) -> None:
+def test_a_jump_of_ros_time_resets_the_stream(setup: Setup) -> None:
     """Stamps go on as if nothing had happened; only /clock says that the world was reset."""
     node = setup.node(use_sim_time=True, drop_frames=False)
     probe = setup.probe()

@@ -154,7 +154,7 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
     assert np.isnan(depth_of(client.result(client.send(picture)))).all()
 
 
-def test_fixed_scale_multiplies_depth_and_a_scene_cut_starts_the_stream_anew(bench: Bench) -> None:
+def test_fixed_scale_multiplies_depth_and_a_scene_cut_resets_the_stream(bench: Bench) -> None:
     client = bench.start(metric_source="fixed", metric_scale=1.0, scene_cut_threshold=0.5)
     one, other = (picture for picture in frames(2, 72, 96, seed=1))
     client.result(client.send(one))

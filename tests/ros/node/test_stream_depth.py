@@ -280,7 +280,7 @@ def test_an_unusable_camera_info_is_named_and_ignored(
     lossless[0].wait_log(rf"WARN\].*/camera_info: {reason}")
 
 
-def test_another_resolution_starts_the_stream_anew(client: Client) -> None:
+def test_another_resolution_resets_the_stream(client: Client) -> None:
     first = depth_bytes(play(client, frames(2)))
     other = play(client, frames(1, 24, 32))[0]["depth/image"]
     assert (other.height, other.width) == (24, 32)
