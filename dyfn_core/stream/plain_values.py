@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -80,6 +80,8 @@ def _instance(plain: dict[str, Any], tensors: dict[str, Tensor], kinds: Kinds) -
     kind = kinds[plain["type"]]
     content = {name: from_plain(value, tensors, kinds) for name, value in plain["fields"].items()}
     expected = {f.name for f in fields(kind)}
-    if set(content) != expected:
+    # A file from before a field was added has its default.
+    needed = {f.name for f in fields(kind) if f.default is f.default_factory is MISSING}
+    if not needed <= set(content) <= expected:
         raise PlainError(f"{plain['type']} has {sorted(content)}, expected {sorted(expected)}")
     return kind(**content)

@@ -238,6 +238,15 @@ def test_plain_values_come_back_with_their_types(value: object) -> None:
     assert type(back) is type(value)
 
 
+def test_a_field_that_a_file_lacks_has_its_default_and_others_are_refused() -> None:
+    kinds = {"Map": MetricMap}
+    plain = {"type": "Map", "fields": {"scale": 2.0}}
+    assert from_plain(plain, {}, kinds) == MetricMap(2.0, 0.0)
+    for fields in ({"shift": 1.0}, {"scale": 2.0, "tilt": 1.0}):
+        with pytest.raises(PlainError, match="expected"):
+            from_plain({"type": "Map", "fields": fields}, {}, kinds)
+
+
 def test_unknown_types_are_refused_both_ways() -> None:
     with pytest.raises(TypeError, match="object"):
         to_plain(object(), {}, {})
