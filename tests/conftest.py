@@ -21,7 +21,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.g
 GOLDEN = ROOT / "tests" / "golden"
 # Marker -> the folders and the fixtures whose tests carry it; pyproject.toml says what it means.
 ROS_FOLDERS = ("tests/ros/node", "tests/ros/demo", "tests/ros/online_offline")
-MARKED_FIXTURES = {"gl": {"renderer"}, "golden": {"shared_dir", "golden_file"}}
+MARKED_FIXTURES = {"gl": {"renderer"}, "golden": {"shared_dir", "golden_file", "golden_losses"}}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -35,11 +35,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(marker)
 
 
+def _shared() -> Path:
+    return Path(os.environ.get("DYFN_SHARED", ROOT.parent / "shared"))
+
+
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """The folder of large golden files and real recordings, which not every machine has."""
-    default = ROOT.parent / "shared"
-    path = Path(os.environ.get("DYFN_SHARED", default))
+    path = _shared()
     if not path.is_dir():
         pytest.skip(f"{path} is absent: set DYFN_SHARED to the folder of golden files")
     return path
@@ -56,6 +59,13 @@ def golden_file(request: pytest.FixtureRequest) -> Callable[[str], Path]:
         return shared / "golden" / name
 
     return find
+
+
+@pytest.fixture(scope="session")
+def golden_losses() -> Path:
+    """All recorded losses and alignments where they are, else the repository's part of them."""
+    whole = _shared() / "golden" / "losses_alignment.npz"
+    return whole if whole.exists() else GOLDEN / "losses_alignment_small.npz"
 
 
 @pytest.fixture(autouse=True)

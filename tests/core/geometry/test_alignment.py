@@ -132,8 +132,8 @@ def test_frame_without_any_weight_gets_scale_and_shift_zero() -> None:
     assert not shift[1].any()
 
 
-def golden_case(shared_dir: Path, name: str) -> dict[str, Tensor]:
-    with np.load(shared_dir / "golden" / "losses_alignment.npz") as arrays:
+def golden_case(golden_losses: Path, name: str) -> dict[str, Tensor]:
+    with np.load(golden_losses) as arrays:
         found = {
             key.removeprefix(f"{name}/"): torch.from_numpy(arrays[key]).double()
             for key in arrays.files
@@ -147,9 +147,9 @@ def golden_case(shared_dir: Path, name: str) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("trunc", TRUNCS)
 @pytest.mark.parametrize("rep", [0, 1, 2])
-def test_solvers_match_the_golden_ones(shared_dir: Path, rep: int, trunc: float | None) -> None:
+def test_solvers_match_the_golden_ones(golden_losses: Path, rep: int, trunc: float | None) -> None:
     def case(name: str) -> tuple[tuple[Tensor, Tensor, Tensor], dict[str, Tensor]]:
-        found = golden_case(shared_dir, f"{name}/rep{rep}_trunc{trunc}")
+        found = golden_case(golden_losses, f"{name}/rep{rep}_trunc{trunc}")
         keys = ("x", "y", "w") if name == "align" else ("src", "tgt", "w")
         return tuple(found[f"in/{key}"] for key in keys), found  # type: ignore[return-value]
 
