@@ -13,7 +13,9 @@ class OutputError(OSError):
 
 
 @contextmanager
-def finished_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
+def finished_file(
+    path: Path, *, durable: bool = False, previous: Path | None = None
+) -> Iterator[Path]:
     """A name to write to, which becomes `path` at the end and is removed after an exception.
 
     An older file at `path` stays until then. Several processes may write one file at once: each
@@ -23,6 +25,8 @@ def finished_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         path: the file to write.
         durable: flush the content to the disk before the file takes its name, so that a loss of
             power leaves the old file or the new one.
+        previous: where the old file at `path` goes, if there is one, in the place of what is
+            there. At every moment one of the two is whole.
 
     Raises:
         OutputError: for an OSError; it names the file.
@@ -32,12 +36,20 @@ def finished_file(path: Path, *, durable: bool = False) -> Iterator[Path]:
         yield partial
         if durable:
             _flush(partial)
+        if previous is not None and path.exists():
+            path.replace(previous)
         partial.replace(path)
     except BaseException as error:
         partial.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise cannot_write(path, error) from error
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a small UTF-8 file as finished_file does. Raises OutputError."""
+    with finished_file(path) as partial:
+        partial.write_text(text, encoding="utf-8")
 
 
 def _flush(path: Path) -> None:

@@ -1,14 +1,15 @@
-"""What a run writes whole or not at all: texts, and state.pt with the one before it kept."""
+"""The state of a run on disk: state.pt, whole or not at all, with the one before it kept."""
 
 from __future__ import annotations
 
 import logging
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from dyfn_core.files import finished_file
 
 STATE_FILE = "state.pt"
 PREVIOUS_FILE = "state.previous.pt"
@@ -31,22 +32,11 @@ def write_state(folder: Path, state: dict[str, Any]) -> None:
     At every moment at least one of the two is whole. Raises OSError, the old files untouched,
     when the disk does not take it.
     """
-    partial = folder / (STATE_FILE + ".partial")
-    with partial.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
     current = folder / STATE_FILE
-    if current.exists():
-        current.replace(folder / PREVIOUS_FILE)
-    partial.replace(current)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a small file; a reader, or a run that follows a kill, sees the old or the new one."""
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # processes may write one file
-    partial.write_text(text)
-    partial.replace(path)
+    for stale in folder.glob(f".{STATE_FILE}.*.partial"):  # of a process that was killed
+        stale.unlink()
+    with finished_file(current, durable=True, previous=folder / PREVIOUS_FILE) as partial:
+        torch.save(state, partial)
 
 
 def read_state(folder: Path) -> dict[str, Any]:

@@ -17,8 +17,8 @@ import torch
 import yaml
 from torch.utils.tensorboard import SummaryWriter
 
+from dyfn_core.files import write_text
 from dyfn_core.training.config import RunConfig
-from dyfn_core.training.loop.checkpoint import write_text
 
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"

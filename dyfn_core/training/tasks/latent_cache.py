@@ -16,9 +16,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
+from dyfn_core.files import finished_file, write_text
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.training.config import ConfigError
-from dyfn_core.training.loop.checkpoint import write_text
 from dyfn_core.training.loop.processes import own_place, wait_for_every_process
 
 META = "cache.json"
@@ -125,9 +125,8 @@ class CacheFolder:
             batch = next(batches)
             if self._path(index).exists():
                 continue
-            partial = self._path(index).with_suffix(f".{own_place()[0]}.partial")
-            save_file(make(batch), partial)
-            partial.replace(self._path(index))
+            with finished_file(self._path(index)) as partial:
+                save_file(make(batch), partial)
 
     def load(self) -> list[dict[str, Tensor]]:
         """All files in order."""

@@ -13,6 +13,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -250,6 +252,24 @@ def test_validation_on_what_is_trained_on_is_said(
     with torch.no_grad():
         UnrolledTask(config, tmp_path / "latents").validate()
     assert "nothing is held out" in caplog.text
+
+
+def test_frames_of_a_recording_are_validated_on_in_numeric_order(
+    place: Path, tmp_path: Path
+) -> None:
+    for index in range(12):
+        for name, image in (
+            ("rgb", np.full((64, 64, 3), 20 * index, np.uint8)),
+            ("depth", np.full((64, 64), 1000 + 100 * index, np.uint16)),
+        ):
+            (tmp_path / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / name / f"{index}.png"), image)
+    np.savetxt(tmp_path / "K.txt", [[60, 0, 32], [0, 60, 32], [0, 0, 1]])
+    config = settings(place, f"validation_rgbd={tmp_path}", "validation_stride=1")
+    with torch.no_grad():
+        (recorded,) = UnrolledTask(config, tmp_path / "latents").sequences["recorded"]
+    found = recorded.depth.flatten(1).mean(1)
+    torch.testing.assert_close(found, 1 + 0.1 * torch.arange(12.0))
 
 
 def damaged_copy(place: Path, tmp_path: Path) -> str:

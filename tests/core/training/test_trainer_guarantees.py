@@ -238,9 +238,14 @@ def test_two_damaged_states_are_an_error_that_names_both(two_states: Path) -> No
         Trainer(ToyTask(), toy_config(), two_states, resume=True)
 
 
-def test_half_written_state_is_never_loaded(two_states: Path) -> None:
-    (two_states / (STATE_FILE + ".partial")).write_bytes(b"half")
+def test_half_written_state_is_never_loaded_nor_kept(two_states: Path) -> None:
+    half = two_states / f".{STATE_FILE}.12345.partial"
+    half.write_bytes(b"half")
     assert read_state(two_states)["step"] == 2
+    write_state(two_states, {"step": 3})
+    assert not half.exists()
+    steps = [torch.load(two_states / name)["step"] for name in (STATE_FILE, PREVIOUS_FILE)]
+    assert steps == [3, 2]
 
 
 def test_full_disk_leaves_the_old_state(two_states: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -251,6 +256,7 @@ def test_full_disk_leaves_the_old_state(two_states: Path, monkeypatch: pytest.Mo
     with pytest.raises(OSError, match="No space"):
         write_state(two_states, {"step": 3})
     assert read_state(two_states)["step"] == 2
+    assert not list(two_states.glob("*.partial")) + list(two_states.glob(".*.partial"))
 
 
 def test_run_folder_tells_settings_versions_and_results(tmp_path: Path) -> None:
