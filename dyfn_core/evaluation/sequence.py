@@ -13,14 +13,14 @@ from dyfn_core.evaluation.report.html import Cell, Table
 from dyfn_core.evaluation.report.pictures import FrameStrip, curves
 from dyfn_core.evaluation.report.worst_frames import WorstFrames
 from dyfn_core.prediction import DEPTH
+from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import (
-    ControlledScorer,
-    FrameScore,
+    CONTROLS,
     SequenceScore,
     SequenceScorer,
     spread,
-    to_shape,
 )
+from dyfn_core.scoring.variants import VariantScorers
 
 COLUMNS = (
     "frame",
@@ -35,6 +35,8 @@ COLUMNS = (
     "scale",
     "shift",
 )
+PREDICTION = "prediction"
+CONTROL_SAMPLES = (4_000, 800_000)  # of a frame, and of the sequence
 COUNTS = ("frame", "pixels")  # those of COLUMNS that are integers
 
 
@@ -43,13 +45,22 @@ class SequenceEvaluation:
 
     expected_frames: how many there will be, for the choice of the strip's frames.
     depth_max: cap of the ground truth in metres. quantity: what is pushed as depth; affine-
-    invariant disparity is aligned as such (protocols.SequenceScorer).
+    invariant disparity is aligned as such (protocols.SequenceScorer). scorer: of what is pushed;
+    controls: by name, on the same pixels; others of the same frames may be added at the end.
     """
 
     def __init__(
         self, expected_frames: int, depth_max: float = float("inf"), quantity: str = DEPTH
     ) -> None:
-        self.scores = ControlledScorer(depth_max, quantity=quantity)
+        self._scorers = VariantScorers(
+            (PREDICTION,),
+            quantity,
+            scorer=lambda quantity: SequenceScorer(depth_max, quantity=quantity),
+            control_scorer=lambda quantity: SequenceScorer(depth_max, *CONTROL_SAMPLES, quantity),
+            controls={name: name for name in CONTROLS},
+        )
+        self.scorer = self._scorers.first
+        self.controls = {name: self._scorers.scorers[name] for name in CONTROLS}
         self.strip = FrameStrip(expected_frames, quantity=quantity)
         self.worst = WorstFrames(expected_frames, quantity)
         self._stamps, self._latencies = array("d"), array("d")  # seconds
@@ -78,15 +89,17 @@ class SequenceEvaluation:
         self._latencies.append(latency)
         if truth is None:
             nothing = np.full((1, 1), np.nan, np.float32)
-            return self.scores.push(nothing, nothing)
-        score = self.scores.push(to_shape(masked, truth.shape), truth)
+            self._scorers.push({PREDICTION: nothing}, nothing)
+            return self.scorer.frames[-1]
+        self._scorers.push({PREDICTION: masked}, truth)
+        score = self.scorer.frames[-1]
         self.worst.add(len(self._stamps) - 1, image, masked, truth, score)
         return score
 
     @property
     def quantity(self) -> str:
         """What is pushed: depth or disparity."""
-        return self.scores.scorer.quantity
+        return self.scorer.quantity
 
     @property
     def frames(self) -> int:
@@ -104,11 +117,11 @@ class SequenceEvaluation:
 
     def video(self) -> SequenceScore | None:
         """The sequence under the video protocol."""
-        return self.scores.scorer.video()
+        return self.scorer.video()
 
     def results(self) -> dict[str, Any]:
         """What goes into metrics.json: protocols (None without truth), controls, spread."""
-        scorer = self.scores.scorer
+        scorer = self.scorer
         video = self.video()
         return {
             "frames": self.frames,
@@ -120,14 +133,14 @@ class SequenceEvaluation:
             "spread": spread(scorer.frames),
             "controls": {
                 name: {"image": _means(control.image()), "video": _means(control.video())}
-                for name, control in self.scores.controls.items()
+                for name, control in self.controls.items()
             },
             "output_sha256": self.output_hash,
         }
 
     def column(self, name: str) -> np.ndarray:
         """One of COLUMNS of every frame, float64; NaN where there is no truth."""
-        scores, video = self.scores.scorer.frames, self.video()
+        scores, video = self.scorer.frames, self.video()
         protocol, _, metric = name.partition("_")
         if name == "frame":
             return np.arange(self.frames, dtype=np.float64)

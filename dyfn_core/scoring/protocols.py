@@ -176,14 +176,15 @@ def least_squares(prediction: np.ndarray, target: np.ndarray) -> tuple[float, fl
 
 def predicted(prediction: np.ndarray, quantity: str = DEPTH) -> np.ndarray:
     """Where a prediction says something: finite and positive; disparity may be 0, far away."""
-    return np.isfinite(prediction) & (prediction >= 0 if quantity == DISPARITY else prediction > 0)
+    valid: np.ndarray = np.isfinite(prediction)
+    return valid & (prediction >= 0 if quantity == DISPARITY else prediction > 0)
 
 
 def align_depth(
     prediction: np.ndarray, scale: float, shift: float, quantity: str = DEPTH
 ) -> np.ndarray:
     """The aligned prediction as depth, float64; aligned disparity <= 0 is FARTHEST away."""
-    aligned = scale * prediction.astype(np.float64) + shift
+    aligned: np.ndarray = scale * prediction.astype(np.float64) + shift
     return 1 / np.maximum(aligned, 1 / FARTHEST) if quantity == DISPARITY else aligned
 
 
@@ -209,7 +210,8 @@ def to_shape(image: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         )
     row = (np.arange(rows) * 2 + 1) * height // (2 * rows)
     column = (np.arange(columns) * 2 + 1) * width // (2 * columns)
-    return image[row[:, None], column]
+    nearest: np.ndarray = image[row[:, None], column]
+    return nearest
 
 
 def ramp(shape: tuple[int, int]) -> np.ndarray:
@@ -224,36 +226,6 @@ def constant(shape: tuple[int, int]) -> np.ndarray:
 
 
 CONTROLS: dict[str, Callable[[tuple[int, int]], np.ndarray]] = {"ramp": ramp, "constant": constant}
-
-
-class ControlledScorer:
-    """A SequenceScorer with the controls scored beside it on the same pixels.
-
-    Print the floors with every result: a low error of an easy scene proves nothing. controls:
-    by name; others of the same frames may be added when all of these are pushed.
-    """
-
-    def __init__(
-        self,
-        depth_max: float = math.inf,
-        control_samples: int = 4_000,
-        max_control_samples: int = 800_000,
-        quantity: str = DEPTH,
-    ) -> None:
-        self.scorer = SequenceScorer(depth_max, quantity=quantity)
-        limits = depth_max, control_samples, max_control_samples
-        self.controls = {name: SequenceScorer(*limits) for name in CONTROLS}
-
-    def push(
-        self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None
-    ) -> FrameScore:
-        """As SequenceScorer.push."""
-        valid = predicted(prediction, self.scorer.quantity)
-        if mask is not None:
-            valid &= mask
-        for name, control in CONTROLS.items():
-            self.controls[name].push(control((target.shape[0], target.shape[1])), target, valid)
-        return self.scorer.push(prediction, target, valid)
 
 
 def spread(frames: Sequence[FrameScore]) -> dict[str, float] | None:

@@ -50,6 +50,7 @@ class VariantScorers:
         variants: names of the predictions; pictures are of the first.
         quantity: of all of them; see SequenceScorer.
         scorer: gives an empty scorer of a quantity.
+        control_scorer: the same for the controls, which may do with fewer samples; None: scorer.
         controls: the name that each of CONTROLS has beside the variants. They are scored where
             the first variant predicts something.
 
@@ -65,12 +66,14 @@ class VariantScorers:
             quantity=quantity
         ),
         controls: Mapping[str, str] | None = None,
+        control_scorer: Callable[[str], SequenceScorer] | None = None,
     ) -> None:
         self.variants = tuple(variants)
         self.quantity = quantity
         self._controls = dict(controls or {})
         self.scorers = {name: scorer(quantity) for name in self.variants}
-        self.scorers |= {name: scorer(DEPTH) for name in self._controls.values()}
+        empty = control_scorer or scorer
+        self.scorers |= {name: empty(DEPTH) for name in self._controls.values()}
 
     @property
     def first(self) -> SequenceScorer:

@@ -131,7 +131,7 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     if result.base is not None:
         runs[run_name({**metrics, "stabilizer": False})] = result.base
     clouds = {} if result.cloud is None else {f"{name}, fused, from above": result.cloud}
-    controlled = result.evaluation.scores.controls.keys() > CONTROLS.keys()
+    controlled = result.evaluation.controls.keys() > CONTROLS.keys()
     sections = sequence_sections(runs, clouds, CONTROLS_NOTE if controlled else "")
     if notes:
         rows = [[text, count] for text, count in notes.items()]

@@ -68,7 +68,7 @@ def replay(
         elif run.compare:
             reader.warn(f"--compare: {run.model} ran without DyFN, there is nothing to compare")
         if run.controls:
-            evaluation.scores.controls |= _controls(source, run, model, outputs)
+            evaluation.controls |= _controls(source, run, model, outputs)
     options = {
         "num_tokens": run.num_tokens,
         "scene_cut_threshold": run.scene_cut_threshold,
@@ -123,5 +123,5 @@ def _controls(
         with stabilized_by(model, control):
             controlled = replace(run, stabilizer=True)
             evaluation = _evaluate(SourceReader(source), controlled, model, outputs)
-        found[name] = evaluation.scores.scorer
+        found[name] = evaluation.scorer
     return found

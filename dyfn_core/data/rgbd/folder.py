@@ -125,7 +125,7 @@ class RgbdFolder:
         if frame.depth is None:
             return None
         stored = read_uint16(frame.depth)
-        metres = stored.astype(np.float32) / np.float32(self.unit)
+        metres: np.ndarray = stored.astype(np.float32) / np.float32(self.unit)
         metres[np.isin(stored, (0, *self.invalid))] = np.nan
         return metres
 

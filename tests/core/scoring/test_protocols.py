@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from dyfn_core.scoring.protocols import (
-    ControlledScorer,
     SequenceScorer,
     constant,
     ramp,
@@ -120,18 +119,6 @@ def test_memory_is_bounded_and_the_result_hardly_changes() -> None:
 def test_the_sample_grid_is_dense_and_bounded(shape: tuple[int, int]) -> None:
     chosen = np.zeros(shape)[sample_grid(shape, 1000)]
     assert 250 < chosen.size <= 1100
-
-
-def test_controls_see_the_same_pixels_and_lose_to_a_good_prediction() -> None:
-    scorer = ControlledScorer()
-    for index in range(3):
-        prediction = scene(index) * 3
-        prediction[:12] = np.nan
-        scorer.push(prediction, scene(index))
-    good, flat = scorer.scorer.image(), scorer.controls["constant"].image()
-    assert good is not None and flat is not None
-    assert good.metrics["abs_rel"] < 0.001 < 0.2 < flat.metrics["abs_rel"]
-    assert [f.pixels for f in scorer.controls["ramp"].frames] == [384] * 3
 
 
 def test_the_ramp_explains_a_floor_and_the_constant_a_wall() -> None:

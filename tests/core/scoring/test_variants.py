@@ -49,6 +49,22 @@ def test_controls_are_scored_where_the_first_variant_predicts() -> None:
     assert np.isnan(maps["constant"][:12]).all() and not np.isnan(maps["constant"][12:]).any()
 
 
+def test_controls_may_do_with_fewer_samples_and_lose_to_a_good_prediction() -> None:
+    scorers = VariantScorers(
+        ("good",),
+        controls={"constant": "constant"},
+        control_scorer=lambda quantity: SequenceScorer(samples_per_frame=192, quantity=quantity),
+    )
+    for index in range(3):
+        scorers.push({"good": scene(index) * 3}, scene(index))
+    assert [len(s.frames) for s in scorers.scorers.values()] == [3, 3]
+    assert [s.frames[0].pixels for s in scorers.scorers.values()] == [768, 192]
+    scores = scorers.scores()
+    good, flat = scores["good"], scores["constant"]
+    assert good is not None and flat is not None
+    assert good.image_abs_rel < 0.001 < 0.2 < flat.image_abs_rel
+
+
 def test_disparity_is_aligned_with_the_inverse_of_depth_and_controls_as_depth() -> None:
     scorers = VariantScorers(("disparity",), DISPARITY, controls={"constant": "constant"})
     truth = scene(3)
