@@ -78,7 +78,7 @@ class Camera:
         self._info: CameraInfo | None = None
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
-        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings(), warn)
+        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings())
 
     @property
     def prefix(self) -> str:
@@ -163,7 +163,8 @@ class Camera:
         """Once, before the first frame. Raises ValueError when a metric setting is unusable."""
         session = StreamSession(model, self.settings)
         _ = session.fingerprint  # takes seconds for a large model, which nobody waits for here
-        self.session = self.scale_topics.session = session
+        self.scale_topics.open(session, self.settings, self._warn)
+        self.session = session
 
     def decode(self, job: FrameJob) -> tuple[Frame, CameraInfo | None]:
         """-> the frame and the CameraInfo that describes it as it now is.

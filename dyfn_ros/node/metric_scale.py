@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import sensor_msgs.msg
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -22,9 +23,7 @@ _REFERENCE_DEPTH = 20
 class ScaleTopics:
     """~/scale, ~/scale/status and the reference topic of one camera.
 
-    Made on configure, before there is a session; what comes before `session` is set is not kept.
-    warn: takes the reason why a measurement cannot be read. Raises ValueError when the settings
-    of the reference are not usable.
+    Made on configure, before there is a model; measurements that come before `open` are not kept.
     """
 
     def __init__(
@@ -33,14 +32,12 @@ class ScaleTopics:
         prefix: str,
         title: str,
         settings: Settings,
-        warn: Callable[[str], None],
     ) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._title = title
         self._scale = ports.publisher(Float64, f"~/{prefix}scale", latched)
         self._status = ports.publisher(DiagnosticStatus, f"~/{prefix}scale/status", latched)
-        self._reference = message_references(settings, lambda why: warn(f"{self.topic}: {why}"))
-        self.session: StreamSession | None = None
+        self._take: Callable[[Any], None] = lambda message: None
         self.topic = ""
         if settings.metric_source == "reference":
             kind = getattr(sensor_msgs.msg, settings.reference_type)
@@ -48,16 +45,23 @@ class ScaleTopics:
                 depth=_REFERENCE_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT
             )
             subscription = ports.subscription(
-                kind, f"{prefix}reference", self._on_reference, best_effort
+                kind, f"{prefix}reference", lambda message: self._take(message), best_effort
             )
             self.topic = subscription.topic_name
 
-    def _on_reference(self, message: object) -> None:
-        """Executor's thread."""
-        if self.session is not None:
-            stamp = message.header.stamp  # type: ignore[attr-defined]
-            seconds = stamp.sec + stamp.nanosec * 1e-9
-            self.session.add_reference(seconds, self._reference(message))
+    def open(self, session: StreamSession, settings: Settings, warn: Callable[[str], None]) -> None:
+        """Give the session what comes from now on.
+
+        warn: takes the reason why a measurement cannot be read. Raises ValueError when the
+        settings of the reference are not usable.
+        """
+        reference = message_references(settings, lambda reason: warn(f"{self.topic}: {reason}"))
+
+        def take(message: Any) -> None:  # executor's thread
+            stamp = message.header.stamp
+            session.add_reference(stamp.sec + stamp.nanosec * 1e-9, reference(message))
+
+        self._take = take
 
     def publish(self, scale: ScaleInForce) -> None:
         """Both are latched and follow every frame: a number to plot, and all that is known."""
