@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from seeded import normal, uniform
 
+from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.losses.video_protocol import video_protocol_loss
 from dyfn_core.scoring.protocols import SequenceScorer
 
 
 def clips(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    truth = torch.rand(2, 5, 48, generator=generator, dtype=torch.float64) * 4 + 1
-    noise = torch.randn(2, 5, 48, generator=generator, dtype=torch.float64)
-    drift = torch.randn(2, 5, 1, generator=generator, dtype=torch.float64)
+    rng = np.random.default_rng(seed)
+    truth = uniform(rng, 2, 5, 48, dtype=torch.float64) * 4 + 1
+    noise = normal(rng, 2, 5, 48, dtype=torch.float64)
+    drift = normal(rng, 2, 5, 1, dtype=torch.float64)
     return truth * (0.1 * noise + 0.3 * drift).exp() * 0.5 + 0.2, truth
 
 
@@ -33,16 +35,34 @@ def test_loss_is_the_video_protocols_abs_rel() -> None:
 
 
 def test_gradient_is_that_of_the_minimum() -> None:
+    """Where the minimum is smooth, the difference of two minima is the gradient to the last bits.
+
+    The best fit passes through two samples of a clip, and the error has a kink at each. As long
+    as these two samples stay and no other sample meets the fit, the fit stays too, and the error
+    is linear in the other samples.
+    """
     prediction, truth = clips(1)
     prediction.requires_grad_()
     (gradient,) = torch.autograd.grad(video_protocol_loss(prediction, truth), prediction)
-    direction = torch.randn(2, 5, 1, generator=torch.Generator().manual_seed(2)).double()
-    step = 1e-5 * direction * prediction.detach()  # every frame by its own factor
-    with torch.no_grad():
-        ahead = video_protocol_loss(prediction + step, truth)
-        behind = video_protocol_loss(prediction - step, truth)
-    # The fit passes through two of a clip's 240 samples, where the error has a kink.
-    assert float((gradient * step).sum()) == pytest.approx(float(ahead - behind) / 2, rel=0.05)
+    prediction = prediction.detach()
+    fits = [
+        fit_scale_shift(p.numpy().ravel(), d.numpy().ravel(), 1 / d.numpy().ravel())
+        for p, d in zip(prediction, truth, strict=True)
+    ]
+    scale, shift = torch.tensor(fits, dtype=torch.float64).T[:, :, None, None]
+    residual = (scale * prediction + shift - truth).abs()
+    kink = residual < 1e-12
+    assert kink.flatten(1).sum(1).tolist() == [2, 2]
+    assert residual[~kink].min() > 1e-3  # metres to the next kink
+    direction = normal(2, 2, 5, 1, dtype=torch.float64)  # every frame by its own factor
+    step = torch.where(kink, 0.0, 1e-5 * direction * prediction)
+    assert (scale * step).abs().max() < 1e-3
+    ahead = video_protocol_loss(prediction + step, truth)
+    behind = video_protocol_loss(prediction - step, truth)
+    assert float((gradient * step).sum()) == pytest.approx(float(ahead - behind) / 2, rel=1e-6)
+    steepest = scale / truth / truth.numel()  # of one sample, on either side of its kink
+    torch.testing.assert_close(gradient.abs()[~kink], steepest.expand_as(truth)[~kink])
+    assert (gradient.abs() <= steepest * (1 + 1e-9))[kink].all()
 
 
 def test_one_scale_and_shift_cost_nothing_and_drift_does() -> None:
