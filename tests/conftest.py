@@ -13,6 +13,7 @@ import torch
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
 from tests.support.pinhole import PinholeModel
+from tests.support.seeded import redraw
 
 THREADS = torch.get_num_threads()
 ROOT = Path(__file__).resolve().parents[1]
@@ -97,8 +98,8 @@ def small_moge() -> MoGeModel:
     )
     model = MoGeModel(config)
     model.stabilizer = build_dyfn(32, DyFNConfig(hidden=8))
-    torch.nn.init.normal_(model.stabilizer.gamma_head.weight, std=0.5)
-    torch.nn.init.normal_(model.stabilizer.beta_head.weight, std=0.5)
+    heads = model.stabilizer.gamma_head, model.stabilizer.beta_head
+    redraw((head.weight for head in heads), 0.5, seed=0)
     torch.nn.init.ones_(model.head.output_block[1][-1].bias)  # a mask that is mostly True
     return model.eval()
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tests.support.seeded import redraw
 from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
@@ -27,8 +28,8 @@ class PinholeModel(GeometryModel):
         if stabilized:
             torch.manual_seed(0)
             self.stabilizer = build_dyfn(3, DyFNConfig(hidden=4, form="residual"))
-            for head in (self.stabilizer.gamma_head, self.stabilizer.beta_head):
-                torch.nn.init.normal_(head.weight, std=0.05)
+            heads = self.stabilizer.gamma_head, self.stabilizer.beta_head
+            redraw((head.weight for head in heads), 0.05, seed=0)
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> PinholeModel:

@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -73,8 +74,9 @@ def load_tiny(name: str = "tiny", device: str = "cpu") -> GeometryModel:
         raise ValueError(f"model {name!r} is unknown, expected 'tiny'")
     model = TinyModel()
     model.stabilizer = build_dyfn(CHANNELS, DyFNConfig(hidden=8))
-    generator = torch.Generator().manual_seed(7)
+    rng = np.random.default_rng(7)  # not torch's: the same bits on every processor
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter.normal_(0, 0.25, generator=generator)
+            drawn = 0.25 * rng.standard_normal(parameter.shape)
+            parameter.copy_(torch.from_numpy(drawn))
     return model.eval()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tests.support.seeded import redraw, uniform
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import save_model
@@ -55,8 +56,7 @@ class ToyTask(Task):
         size = share_of(BATCH, parts, "the batch")
         step = start
         while True:
-            draw = torch.Generator().manual_seed(step)
-            features = torch.rand(BATCH, 3, 6, 8, generator=draw)[part * size : (part + 1) * size]
+            features = uniform(step, BATCH, 3, 6, 8)[part * size : (part + 1) * size]
             yield Latents(features * (torch.nan if step in self.poison else 1.0))
             step += 1
 
@@ -107,7 +107,7 @@ def tiny_base(place: Path) -> MiniModel:
     torch.manual_seed(0)
     config = MiniConfig(latent_channels=8, stage_channels=(8, 8), context_channels=12, num_tokens=8)
     model = MiniModel(config).eval()
-    torch.nn.init.normal_(model.decoder.points[2].weight, std=0.1)  # type: ignore[arg-type]
+    redraw([model.decoder.points[2].weight], 0.1, seed=0)  # type: ignore[list-item]
     save_model(model, place / "base.safetensors")
     return model
 

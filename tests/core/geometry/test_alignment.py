@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
+from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import (
@@ -110,8 +111,7 @@ def test_fit_says_what_is_wrong_with_its_input(
 @given(seed=st.integers(0, 2**32 - 1), trunc=st.sampled_from(TRUNCS))
 def test_scale_is_the_best_of_all_kinks(seed: int, trunc: float | None) -> None:
     """The objective is piecewise linear, so that one of the y / x is a minimum."""
-    rng = torch.Generator().manual_seed(seed)
-    x, y, w = (torch.randn(7, generator=rng, dtype=torch.float64) for _ in range(3))
+    x, y, w = normal(seed, 3, 7, dtype=torch.float64)
     w = w.clamp(min=0)
     scale, error = align_scale(x, y, w, trunc)
     kinks = y / x
@@ -124,7 +124,7 @@ def test_scale_is_the_best_of_all_kinks(seed: int, trunc: float | None) -> None:
 
 
 def test_frame_without_any_weight_gets_scale_and_shift_zero() -> None:
-    points = torch.rand(2, 6, 3)
+    points = uniform(0, 2, 6, 3)
     weight = torch.ones(2, 6)
     weight[1] = 0
     scale, shift = align_points(points, 2 * points, weight, "z", 1.0)

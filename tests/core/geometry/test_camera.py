@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
+from tests.support.seeded import uniform
 
 from dyfn_core.geometry.camera import (
     check_camera_matrix,
@@ -136,7 +137,7 @@ def test_pixel_and_normalised_intrinsics_undo_each_other() -> None:
 def test_unprojected_points_project_back_onto_their_pixels() -> None:
     matrix = np.array([[50.0, 0, 29], [0, 55.0, 25], [0, 0, 1]])
     intrinsics = torch.from_numpy(normalize_intrinsics(matrix, (48, 64)))[None]
-    depth = torch.rand(1, 48, 64, dtype=torch.float64) + 1
+    depth = uniform(0, 1, 48, 64, dtype=torch.float64) + 1
     points = depth_to_points(depth, intrinsics)
     pixels = (points[0] @ torch.from_numpy(matrix).T).numpy()
     pixels = pixels[..., :2] / pixels[..., 2:]

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
+from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import (
@@ -74,12 +75,12 @@ def least_error(
 
 def draw(seed: int, count: int, dims: int, rounded: bool) -> tuple[Tensor, Tensor, Tensor]:
     """A noisy affine relation with outliers and some zero weights; rounding makes ties."""
-    rng = torch.Generator().manual_seed(seed)
-    x = torch.randn(1, count, dims, generator=rng, dtype=torch.float64)
-    y = 1.5 * x + torch.randn(1, 1, dims, generator=rng, dtype=torch.float64)
-    y = y + 0.3 * torch.randn(1, count, dims, generator=rng, dtype=torch.float64)
-    y[:, ::3] += 2 * torch.randn(1, len(range(0, count, 3)), dims, generator=rng).double()
-    w = torch.rand(1, count, generator=rng, dtype=torch.float64)
+    rng = np.random.default_rng(seed)
+    x = normal(rng, 1, count, dims, dtype=torch.float64)
+    y = 1.5 * x + normal(rng, 1, 1, dims, dtype=torch.float64)
+    y = y + 0.3 * normal(rng, 1, count, dims, dtype=torch.float64)
+    y[:, ::3] += 2 * normal(rng, 1, len(range(0, count, 3)), dims, dtype=torch.float64)
+    w = uniform(rng, 1, count, dtype=torch.float64)
     w = torch.where(w < 0.15, 0.0, w)
     w[:, 0] = 0.7
     if rounded:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import HUBER, canonical_scale_loss
@@ -30,7 +31,7 @@ ASPECT = 4 / 3
 def scene(frames: int = 2, seed: int = 0, size: tuple[int, int] = (24, 32)) -> Target:
     """Smooth depth of 1 to 6 m, with a strip of sky and a strip of nothing."""
     torch.manual_seed(seed)
-    coarse = 1 + 5 * torch.rand(frames, 1, 4, 4)
+    coarse = 1 + 5 * uniform(seed, frames, 1, 4, 4)
     depth = torch.nn.functional.interpolate(coarse, size=size, mode="bicubic")[:, 0].clamp(0.5)
     depth[:, :3] = math.inf
     depth[:, -2:] = math.nan
@@ -66,7 +67,7 @@ def test_frame_loss_ignores_scale_and_shift_of_each_frame() -> None:
     scale, _ = align_frames(exact, target)
     torch.testing.assert_close(scale, torch.tensor([2.0, 0.1]))
     assert float(whole_frames(exact, target)) < 1e-5
-    assert float(whole_frames(exact + 0.2 * torch.rand_like(exact), target)) > 0.02
+    assert float(whole_frames(exact + 0.2 * uniform(7, *exact.shape), target)) > 0.02
 
 
 def test_frame_loss_of_a_known_error_is_that_error_over_depth() -> None:
@@ -246,8 +247,7 @@ def test_unknown_alignment_mode_is_refused() -> None:
 
 def noisy_clip() -> tuple[ClipTarget, Tensor]:
     target = clip(frames=3, batch=1)
-    torch.manual_seed(3)
-    return target, affine(target.points, 0.5, 2.0) + 0.05 * torch.randn_like(target.points)
+    return target, affine(target.points, 0.5, 2.0) + 0.05 * normal(3, *target.points.shape)
 
 
 def test_differentiable_alignment_is_close_to_the_exact_one() -> None:

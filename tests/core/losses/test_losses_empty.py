@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from tests.support.seeded import uniform
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
@@ -106,8 +107,7 @@ ALONE = {
 
 
 def depth(kind: str) -> Tensor:
-    torch.manual_seed(0)
-    coarse = 1 + 4 * torch.rand(FRAMES, 1, 3, 3)
+    coarse = 1 + 4 * uniform(0, FRAMES, 1, 3, 3)
     found = torch.nn.functional.interpolate(
         coarse, size=(HEIGHT, WIDTH), mode="bilinear", align_corners=True
     )[:, 0]
@@ -131,7 +131,7 @@ def run(name: str, kind: str) -> tuple[float, Tensor]:
         depth("full"), torch.tensor([0.8, 1.12, 0.5, 0.5]).expand(FRAMES, -1), WIDTH / HEIGHT
     )
     torch.manual_seed(1)
-    points = full.points[None] * (1 + 0.2 * torch.rand(1, FRAMES, HEIGHT, WIDTH, 3))
+    points = full.points[None] * (1 + 0.2 * uniform(1, 1, FRAMES, HEIGHT, WIDTH, 3))
     points = points.requires_grad_()
     loss = TERMS[name](points, target)
     loss.backward()
@@ -235,7 +235,8 @@ def test_disparity_alignment_finds_scale_and_shift() -> None:
 def test_every_term_of_the_objective_can_be_switched_off(form: str) -> None:
     frames = target_from_depth(depth("full"), torch.tensor([[0.8, 1.12, 0.5, 0.5]] * FRAMES), 1.4)
     target = ClipTarget(frames, FRAMES)
-    points = (frames.points * (1 + 0.1 * torch.rand_like(frames.points)))[None].requires_grad_()
+    noise = uniform(2, *frames.points.shape)
+    points = (frames.points * (1 + 0.1 * noise))[None].requires_grad_()
     mask = torch.full((1, FRAMES, HEIGHT, WIDTH), 0.3)
     names = ("align_first", "align_all", "frame", "local", "normal", "mask", "edge", "temporal")
     off = dict.fromkeys(names, 0.0)

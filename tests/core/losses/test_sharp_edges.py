@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.losses.gradient import gradient_loss
@@ -39,7 +40,7 @@ def test_gradient_term_of_nothing_valid_is_zero_with_zero_gradient() -> None:
     target = target_from_depth(
         torch.full((2, 8, 8), math.nan), torch.tensor([[0.8, 0.8, 0.5, 0.5]] * 2), 1.0
     )
-    points = torch.rand(2, 8, 8, 3).add(0.5).requires_grad_()
+    points = uniform(0, 2, 8, 8, 3).add(0.5).requires_grad_()
     loss = gradient_loss(points, target)
     loss.backward()
     assert float(loss.detach()) == 0.0
@@ -59,7 +60,7 @@ def test_residual_block_sees_detail_beside_channels_at_other_levels() -> None:
     """One channel a hundred deviations away must not drown the detail of the others."""
     torch.manual_seed(0)
     block = MiniResidualBlock(64)
-    detail = torch.randn(2, 64, 12, 16)
+    detail = normal(0, 2, 64, 12, 16)
     level = torch.zeros(1, 64, 1, 1)
     level[:, 0], level[:, 33] = 100.0, -100.0
     inner = block(detail + level) - (detail + level)
@@ -71,7 +72,7 @@ def test_residual_block_sees_detail_beside_channels_at_other_levels() -> None:
 def test_every_weight_of_a_residual_block_has_a_gradient() -> None:
     torch.manual_seed(0)
     block = MiniResidualBlock(16)
-    x = torch.randn(2, 16, 8, 8) + 50 * torch.randn(1, 16, 1, 1)
-    (block(x) * torch.randn(2, 16, 8, 8)).sum().backward()
+    x = normal(0, 2, 16, 8, 8) + 50 * normal(1, 1, 16, 1, 1)
+    (block(x) * normal(2, 2, 16, 8, 8)).sum().backward()
     for name, parameter in block.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 1e-4, name

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from seeded import normal, uniform
+from tests.support.seeded import normal, uniform
 
 from dyfn_core.geometry.alignment import fit_scale_shift
 from dyfn_core.losses.video_protocol import video_protocol_loss

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from tests.support.seeded import normal
 from torch import Tensor, nn
 
 from dyfn_core.models.base import GeometryModel
@@ -103,38 +104,35 @@ def test_convolutions_and_their_gradients_are_those_of_torch(
     torch.manual_seed(0)
     ours, theirs = DeterministicConv2d(8, 12, **settings), nn.Conv2d(8, 12, **settings)
     theirs.load_state_dict(ours.state_dict())
-    _compare(ours, theirs, torch.randn(shape))
+    _compare(ours, theirs, normal(0, *shape))
 
 
 def test_a_convolution_of_one_cell_is_that_of_torch() -> None:
     ours, theirs = DeterministicConv2d(8, 12, 1), nn.Conv2d(8, 12, 1)
     theirs.load_state_dict(ours.state_dict())
-    _compare(ours, theirs, torch.randn(3, 8, 1, 1))
+    _compare(ours, theirs, normal(0, 3, 8, 1, 1))
 
 
 @pytest.mark.parametrize("shape", [(2, 7, 8), (3, 8), (1, 1, 8)])
 def test_linear_layers_and_norms_are_those_of_torch(shape: tuple[int, ...]) -> None:
     ours, theirs = DeterministicLinear(8, 12), nn.Linear(8, 12)
     theirs.load_state_dict(ours.state_dict())
-    _compare(ours, theirs, torch.randn(shape))
-    pixels = torch.randn(2, 8, 6, 5).contiguous(memory_format=torch.channels_last)
+    _compare(ours, theirs, normal(0, *shape))
+    pixels = normal(0, 2, 8, 6, 5).contiguous(memory_format=torch.channels_last)
     _compare(DeterministicGroupNorm(4, 8), nn.GroupNorm(4, 8), pixels)
 
 
 def test_half_precision_is_left_to_torch() -> None:
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert DeterministicConv2d(8, 4, 1)(torch.randn(1, 8, 3, 3)).dtype == torch.bfloat16
-        assert DeterministicLinear(8, 4)(torch.randn(1, 3, 8)).dtype == torch.bfloat16
-    assert (
-        DeterministicConv2d(8, 4, 1).double()(torch.randn(1, 8, 3, 3).double()).dtype
-        == torch.float64
-    )
+        assert DeterministicConv2d(8, 4, 1)(normal(0, 1, 8, 3, 3)).dtype == torch.bfloat16
+        assert DeterministicLinear(8, 4)(normal(0, 1, 3, 8)).dtype == torch.bfloat16
+    assert DeterministicConv2d(8, 4, 1).double()(normal(0, 1, 8, 3, 3).double()).dtype == torch.float64
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])
 @pytest.mark.parametrize("align_corners", [False, True])
 def test_resizing_is_that_of_torch(channels: int, align_corners: bool) -> None:
-    x = torch.randn(2, channels, 9, 7)
+    x = normal(0, 2, channels, 9, 7)
     theirs = nn.functional.interpolate(x, (31, 22), mode="bilinear", align_corners=align_corners)
     torch.testing.assert_close(resize(x, (31, 22), align_corners), theirs)
     assert resize(x, (9, 7)) is x

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
+from tests.support.seeded import normal, redraw
 
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
@@ -14,17 +15,14 @@ KINDS = ["convgru", "gru"]
 
 
 def latent(seed: int, batch: int = 1, size: tuple[int, int] = (6, 9)) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(batch, 5, *size, generator=generator) * 3 + 2
+    return normal(seed, batch, 5, *size) * 3 + 2
 
 
 def make(kind: str, form: str = "paper", pool: int = 1, trained: bool = True) -> torch.nn.Module:
     torch.manual_seed(1)
     module = build_dyfn(5, DyFNConfig(kind=kind, hidden=7, pool=pool, form=form))
     if trained:
-        for name, parameter in module.named_parameters():
-            if "head" in name:
-                torch.nn.init.normal_(parameter, std=0.3)
+        redraw((p for name, p in module.named_parameters() if "head" in name), 0.3, seed=100)
     return module.eval()
 
 
@@ -32,8 +30,7 @@ def memory_only(kind: str) -> torch.nn.Module:
     torch.manual_seed(1)
     config = DyFNConfig(kind=kind, hidden=7, form="residual", memory_only=True)
     module = build_dyfn(5, config)
-    for parameter in module.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
+    redraw(module.parameters(), 0.3, seed=100)
     return module.eval()
 
 

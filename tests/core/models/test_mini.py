@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
+from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import load_model, save_model
@@ -47,7 +48,7 @@ def test_encoder_computes_what_the_classifier_with_batch_normalisation_does(
 ) -> None:
     encoder = EfficientNetLite0(folded=False)
     encoder.load_imagenet(weights)
-    image = torch.randn(1, 3, 32, 64)
+    image = normal(0, 1, 3, 32, 64)
     ours = encoder.blocks[0](F.relu6(encoder.stem(image)))
     torch.testing.assert_close(ours, reference_start(image, weights), rtol=1e-4, atol=1e-4)
 
@@ -56,8 +57,7 @@ def test_pretrained_features_fit_the_running_statistics(weights: dict[str, Tenso
     """On smooth images in the right normalisation no layer is far from what it was trained on."""
     encoder = EfficientNetLite0(folded=False)
     encoder.load_imagenet(weights)
-    torch.manual_seed(0)
-    image = F.interpolate(torch.rand(4, 3, 6, 6), size=(128, 128), mode="bicubic") * 2 - 1
+    image = F.interpolate(uniform(0, 4, 3, 6, 6), size=(128, 128), mode="bicubic") * 2 - 1
     for feature in encoder(image):
         assert 0.5 < float(feature.detach().std()) < 20
 
@@ -74,7 +74,7 @@ def test_folding_the_normalisation_changes_nothing(weights: dict[str, Tensor]) -
     model = MiniModel(MiniConfig(folded=False)).eval()
     model.encoder.load_imagenet(weights)
     folded = model.folded()
-    image = torch.rand(1, 3, 64, 96)
+    image = uniform(0, 1, 3, 64, 96)
     assert folded.settings.folded
     assert not [name for name, _ in folded.named_buffers()]
     torch.testing.assert_close(
@@ -85,7 +85,7 @@ def test_folding_the_normalisation_changes_nothing(weights: dict[str, Tensor]) -
 def test_frozen_parts_get_no_gradients_and_the_rest_does(model: MiniModel) -> None:
     model.encoder.frozen_blocks = 3
     try:
-        model.encode_at(torch.rand(1, 3, 64, 64), (64, 64)).features.sum().backward()
+        model.encode_at(uniform(0, 1, 3, 64, 64), (64, 64)).features.sum().backward()
         got = {name for name, p in model.encoder.named_parameters() if p.grad is not None}
         assert not [name for name in got if name.startswith(("stem", "blocks.0.", "blocks.2."))]
         assert {"blocks.3.expand.weight", "blocks.15.project.bias"} <= got
@@ -112,7 +112,7 @@ def test_network_size_keeps_the_budget_and_aspect(
 @pytest.mark.parametrize("size", [(45, 61), (64, 96), (100, 31)])
 def test_points_have_the_size_of_the_image(model: MiniModel, size: tuple[int, int]) -> None:
     with torch.no_grad():
-        latent = model.encode(torch.rand(2, 3, *size), num_tokens=24)
+        latent = model.encode(uniform(0, 2, 3, *size), num_tokens=24)
         decoded = model.decode(latent)
     assert latent.features.shape[-2] * 8 == latent.network_size[0]
     assert decoded.points.shape == (2, *size, 3)
@@ -121,7 +121,7 @@ def test_points_have_the_size_of_the_image(model: MiniModel, size: tuple[int, in
 
 
 def test_images_of_a_batch_do_not_see_each_other(model: MiniModel) -> None:
-    images = torch.rand(2, 3, 64, 64)
+    images = uniform(0, 2, 3, 64, 64)
     with torch.no_grad():
         both = model.decode(model.encode(images)).points
         alone = model.decode(model.encode(images[1:])).points
@@ -137,7 +137,7 @@ def test_remap_makes_x_and_y_proportional_to_z() -> None:
 def test_untrained_model_sees_a_plane_through_a_pinhole(model: MiniModel) -> None:
     """Its x / z grow with the column, its y / z with the row, whatever the image."""
     with torch.no_grad():
-        points = model.decode(model.encode(torch.rand(1, 3, 64, 96))).points[0]
+        points = model.decode(model.encode(uniform(0, 1, 3, 64, 96))).points[0]
     slopes = points[..., :2] / points[..., 2:]
     assert bool((slopes[:, 1:, 0] > slopes[:, :-1, 0]).float().mean() > 0.95)
     assert bool((slopes[1:, :, 1] > slopes[:-1, :, 1]).float().mean() > 0.95)
@@ -149,7 +149,7 @@ def test_checkpoint_brings_the_same_model_back(model: MiniModel, tmp_path: Path)
     saved.stabilizer = build_dyfn(16, DyFNConfig(hidden=4, pool=2, form="residual"))
     save_model(saved, tmp_path / "mini.safetensors")
     loaded = load_model(tmp_path / "mini.safetensors")
-    image = torch.rand(1, 3, 64, 96)
+    image = uniform(0, 1, 3, 64, 96)
     with torch.no_grad():
         ours, state = saved.predict_affine(image)
         theirs, other = loaded.predict_affine(image)

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from tests.support.seeded import redraw
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
@@ -61,10 +62,9 @@ def settings(place: Path, *overrides: str) -> DyFNRunConfig:
 def task(place: Path) -> UnrolledTask:
     """With heads that do something, so that the gradient reaches every parameter."""
     task = UnrolledTask(settings(place), place / "latents")
-    torch.manual_seed(5)
-    assert task.model.stabilizer is not None
-    for head in (task.model.stabilizer.gamma_head, task.model.stabilizer.beta_head):
-        torch.nn.init.normal_(head.weight, std=0.1)  # type: ignore[union-attr,arg-type]
+    made = task.model.stabilizer
+    assert made is not None
+    redraw((made.gamma_head.weight, made.beta_head.weight), 0.1, seed=5)  # type: ignore[union-attr]
     return task
 
 
