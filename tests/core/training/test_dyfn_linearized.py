@@ -85,7 +85,8 @@ def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path:
     features = normal(3, 2, 8, 4, 8) * torch.tensor([1.0, 3.0]).view(2, 1, 1, 1)
     latent, depth = Latent(features, (16, 32), (32, 64)), torch.ones(2, 16, 32)
     slope = scale_slope(made.model, latent, depth)
-    change = 0.01 * normal(4, 2, 16)
+    # Mostly along the slope, so that no sum of terms of both signs is compared.
+    change = 0.003 * (torch.nn.functional.normalize(slope) + 0.25 * normal(4, 2, 16))
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
     gamma, beta = (part.view(2, 8, 1, 1) for part in change.chunk(2, 1))
     moved = replace(latent, features=gamma.exp() * (features - mean) + mean + std * beta)
@@ -93,8 +94,8 @@ def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path:
         after, before = (decoded_z(made.model, one) for one in (moved, latent))
         found = mean_log(after, depth) - mean_log(before, depth)
     wanted = (slope * change).sum(1)
-    torch.testing.assert_close(found, wanted, rtol=0.05, atol=1e-5)
-    assert abs(float(wanted[0] - (slope[1] * change[0]).sum())) > 1e-4  # each frame has its own
+    torch.testing.assert_close(found, wanted, rtol=0.05, atol=0)
+    assert (slope[0] - slope[1]).norm() > 0.1 * slope.norm()  # each frame has its own
 
 
 def test_training_lowers_the_spread_of_the_scales(place: Path, tmp_path: Path) -> None:
@@ -104,16 +105,19 @@ def test_training_lowers_the_spread_of_the_scales(place: Path, tmp_path: Path) -
         *(f"method.{text}" for text in ("noise=0", "length=4", "clips=2", "change_weight=0")),
     )
     batch = next(iter(made.batches(0)))
+    # Of unit length, else the random base decides how much a correction can do.
+    slope = torch.nn.functional.normalize(batch.slope.float(), dim=-1)
+    batch = replace(batch, slope=slope)
     optimizer = torch.optim.Adam(made.groups()[0]["params"], lr=0.05)
     spreads = []
-    for _ in range(250):
+    for _ in range(100):
         loss, values = made.loss(batch)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         spreads.append(values["spread"])
     assert spreads[0] == pytest.approx(values["base_spread"], rel=1e-4)
-    assert spreads[-1] < 0.85 * spreads[0]
+    assert spreads[-1] < 0.7 * spreads[0]
 
 
 def test_command_trains_dyfn_alone_and_keeps_the_usual_statistics(

@@ -100,8 +100,9 @@ def test_gradients_agree_with_those_without_a_cache(task: UnrolledTask) -> None:
         clips = [task.model.encode(clip.float() / 255).features for clip in images.image]
     exact = torch.stack(clips)
     assert not torch.equal(exact, fresh.latent.float())
+    assert torch.equal(exact.half(), fresh.latent)
     unrounded = gradients(task, replace(fresh, latent=exact))
-    assert float((ours - unrounded).norm() / unrounded.norm()) < 0.01
+    assert torch.cosine_similarity(ours, unrounded, dim=0) > 0.99
 
 
 def test_run_without_a_cache_encodes_clips_of_its_own(place: Path, tmp_path: Path) -> None:
