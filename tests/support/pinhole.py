@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tests.support.seeded import redraw
 from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
 from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
+from tests.support.seeded import redraw
 
 FOV_X = 70.0
 

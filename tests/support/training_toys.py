@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from tests.support.seeded import redraw, uniform
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import save_model
@@ -25,6 +24,7 @@ from dyfn_core.training.loop.trainer import Trainer
 from dyfn_core.training.tasks.task import Task
 from tests.support.made_frames import write_shard
 from tests.support.pinhole import PinholeModel
+from tests.support.seeded import redraw, uniform
 
 BATCH = 4
 PATIENCE = 300.0  # seconds for what another process does

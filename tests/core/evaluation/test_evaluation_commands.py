@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import uniform
 
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval import main
@@ -18,6 +17,7 @@ from dyfn_core.evaluation.empirical_study import statistics_grid
 from dyfn_core.models.base import Latent
 from tests.support.made_room import FOCAL, SIZE, room_frame
 from tests.support.pinhole import PinholeModel
+from tests.support.seeded import uniform
 
 FRAMES = 12
 

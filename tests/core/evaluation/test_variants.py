@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import normal
 
 from dyfn_core.evaluation.variants import VARIANTS, gap_closed, score_variants, variant_table
 from dyfn_core.models.controls import StatisticsControl, ema_control, frozen_control, stabilized_by
 from tests.support.pinhole import PinholeModel, picture
+from tests.support.seeded import normal
 
 
 def statistics(features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from tests.support.seeded import normal, uniform
 
 from dyfn_core.cli.train import main
 from dyfn_core.evaluation.empirical_study import change_statistics, statistics_grid
@@ -20,6 +19,7 @@ from dyfn_core.models.mini import MiniModel
 from dyfn_core.scoring.variants import VariantScore
 from dyfn_core.training.config import read_config
 from dyfn_core.training.dyfn_config import DyFNRunConfig
+from tests.support.seeded import normal, uniform
 from tests.support.training_toys import tiny_base, tiny_dyfn_settings
 
 CONFIG = Path(__file__).resolve().parents[3] / "config" / "train_experiments.yaml"

@@ -10,7 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
-from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import (
@@ -20,6 +19,7 @@ from dyfn_core.geometry.alignment import (
     align_scale_shift,
 )
 from dyfn_core.geometry.l1_fit import fit_scale_shift
+from tests.support.seeded import normal, uniform
 
 TRUNCS = (None, 1.0, 0.2)
 

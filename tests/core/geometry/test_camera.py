@@ -10,7 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from tests.support.seeded import uniform
 
 from dyfn_core.geometry.camera import (
     check_camera_matrix,
@@ -25,6 +24,7 @@ from dyfn_core.geometry.camera import (
     solve_focal_shift,
     uv_grid,
 )
+from tests.support.seeded import uniform
 
 
 def scene(seed: int, count: int = 1024, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

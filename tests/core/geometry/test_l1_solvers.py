@@ -10,7 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import Bounds, LinearConstraint, milp
-from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import (
@@ -20,6 +19,7 @@ from dyfn_core.geometry.alignment import (
     align_scale_shift,
     truncated_error,
 )
+from tests.support.seeded import normal, uniform
 
 FAR = 200.0  # larger than any weighted residual here
 TRUNCS = st.sampled_from([None, 1.0, 0.2])

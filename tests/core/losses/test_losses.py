@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import HUBER, canonical_scale_loss
@@ -23,6 +22,7 @@ from dyfn_core.losses.sampled.temporal import temporal_loss
 from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import ClipTarget, Target, target_from_depth
+from tests.support.seeded import normal, uniform
 
 INTRINSICS = torch.tensor([0.8, 1.0667, 0.5, 0.5])
 ASPECT = 4 / 3

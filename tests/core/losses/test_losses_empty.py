@@ -8,7 +8,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import uniform
 from torch import Tensor
 
 from dyfn_core.losses.canonical_scale import canonical_scale_loss
@@ -34,6 +33,7 @@ from dyfn_core.losses.sampled.temporal import temporal_loss
 from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
 from dyfn_core.losses.target import ClipTarget, target_from_depth
+from tests.support.seeded import uniform
 
 FRAMES, HEIGHT, WIDTH = 3, 20, 28
 PAIRS = [(0, 1), (0, 2)]

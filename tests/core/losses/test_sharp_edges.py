@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import torch
-from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.losses.gradient import gradient_loss
 from dyfn_core.losses.target import Target, target_from_depth
 from dyfn_core.models.mini import MiniResidualBlock
+from tests.support.seeded import normal, uniform
 
 
 def step_scene(near: float = 1.0, far: float = 3.0) -> Target:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import normal, uniform
 
-from dyfn_core.geometry.alignment import fit_scale_shift
+from dyfn_core.geometry.l1_fit import fit_scale_shift
 from dyfn_core.losses.video_protocol import video_protocol_loss
 from dyfn_core.scoring.protocols import SequenceScorer
+from tests.support.seeded import normal, uniform
 
 
 def clips(seed: int) -> tuple[torch.Tensor, torch.Tensor]:

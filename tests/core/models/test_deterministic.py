@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tests.support.seeded import normal
 from torch import Tensor, nn
 
 from dyfn_core.models.base import GeometryModel
@@ -19,6 +18,7 @@ from dyfn_core.models.deterministic import (
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.stream.depth_stream import DepthStream, push_together
+from tests.support.seeded import normal
 
 THREADS = (1, 2, 4)
 MOGE = {
@@ -126,7 +126,9 @@ def test_half_precision_is_left_to_torch() -> None:
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert DeterministicConv2d(8, 4, 1)(normal(0, 1, 8, 3, 3)).dtype == torch.bfloat16
         assert DeterministicLinear(8, 4)(normal(0, 1, 3, 8)).dtype == torch.bfloat16
-    assert DeterministicConv2d(8, 4, 1).double()(normal(0, 1, 8, 3, 3).double()).dtype == torch.float64
+    assert (
+        DeterministicConv2d(8, 4, 1).double()(normal(0, 1, 8, 3, 3).double()).dtype == torch.float64
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 3, 5])

@@ -6,10 +6,10 @@ from dataclasses import fields, replace
 
 import pytest
 import torch
-from tests.support.seeded import normal, redraw
 
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
+from tests.support.seeded import normal, redraw
 
 KINDS = ["convgru", "gru"]
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from tests.support.seeded import normal, uniform
 from torch import Tensor
 
 from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.efficientnet import BATCH_NORM_EPS, EfficientNetLite0, imagenet_weights
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
+from tests.support.seeded import normal, uniform
 
 SMALL = MiniConfig(latent_channels=16, stage_channels=(16, 8), context_channels=24)
 

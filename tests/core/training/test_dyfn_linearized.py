@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from tests.support.seeded import normal, redraw
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
@@ -26,6 +25,7 @@ from dyfn_core.training.tasks.gru_input_cache import (
     scale_slope,
 )
 from dyfn_core.training.tasks.latent_cache import encode_clips
+from tests.support.seeded import normal, redraw
 from tests.support.training_toys import tiny_base, tiny_dyfn_settings
 
 

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from tests.support.seeded import redraw
 
 from dyfn_core.cli.train import main
 from dyfn_core.data.clips import draw_batch, find_sequences
@@ -34,6 +33,7 @@ from dyfn_core.training.scaling_curve import images_at, last_doubling
 from dyfn_core.training.tasks.dyfn_unrolled import UnrolledTask
 from dyfn_core.training.tasks.latent_cache import encode_clips
 from tests.support.made_frames import write_shard
+from tests.support.seeded import redraw
 from tests.support.training_toys import (
     PATIENCE,
     environment,
