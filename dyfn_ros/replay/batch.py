@@ -16,6 +16,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dyfn_core.data.files import hidden
 from dyfn_core.files import finished_file
 from dyfn_core.models.checkpoints import model_fingerprint
 from dyfn_ros.recordings.errors import RecordingError
@@ -79,7 +80,7 @@ def _inside(path: Path) -> list[Path]:
         return [path]
     inside = [
         entry
-        for entry in sorted(path.iterdir())
+        for entry in _visible(path)
         if (entry.is_dir() and _is_recording(entry)) or RECORDING_FILE.fullmatch(entry.name)
     ]
     return inside or [path]
@@ -89,9 +90,14 @@ def _is_recording(folder: Path) -> bool:
     """metadata.yaml, RGB-D, or bare files that are the parts of one recording."""
     if (folder / "metadata.yaml").exists() or is_rgbd_folder(folder):
         return True
-    stems = {m["name"] for f in folder.iterdir() if (m := RECORDING_FILE.fullmatch(f.name))}
+    stems = {m["name"] for f in _visible(folder) if (m := RECORDING_FILE.fullmatch(f.name))}
     parts = {m["name"] if (m := PART.fullmatch(stem)) else stem for stem in stems}
-    return len(parts) == 1 and not any(f.is_dir() and _is_recording(f) for f in folder.iterdir())
+    return len(parts) == 1 and not any(f.is_dir() and _is_recording(f) for f in _visible(folder))
+
+
+def _visible(folder: Path) -> list[Path]:
+    """What a folder holds, sorted, without hidden companions."""
+    return sorted(entry for entry in folder.iterdir() if not hidden(entry))
 
 
 def plan(

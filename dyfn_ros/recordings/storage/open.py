@@ -11,6 +11,7 @@ from pathlib import Path, PurePath
 import yaml
 import zstandard
 
+from dyfn_core.data.files import hidden
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.storage.base import DAMAGE, Recorded, Storage, Topic, reason
 from dyfn_ros.recordings.storage.mcap import McapFile
@@ -103,7 +104,7 @@ def _files(folder: Path) -> list[Path]:
     found = {
         (f.stem if f.suffix in PACKED else f.name): f
         for f in sorted(folder.iterdir(), key=lambda f: f.suffix not in PACKED)
-        if _is_file(f) and f.is_file()
+        if _is_file(f) and f.is_file() and not hidden(f)
     }
     return sorted(found.values(), key=lambda f: _natural(f.name))
 

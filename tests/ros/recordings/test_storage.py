@@ -62,6 +62,8 @@ def test_every_storage_gives_the_messages_back(tmp_path: Path, kind: str) -> Non
 def test_a_folder_without_metadata_is_read(tmp_path: Path, kind: str) -> None:
     path = make(tmp_path, kind, 6)
     (path / "metadata.yaml").unlink()
+    for name in ("._a.mcap", "._a.db3"):  # what macOS leaves beside a copied file
+        (path / name).write_bytes(b"\0\5\x16\7")
     found, losses = indices(path)
     assert sorted(found) == list(range(6))
     assert losses == []

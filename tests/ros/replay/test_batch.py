@@ -92,6 +92,13 @@ def test_a_list_names_recordings_beside_it(walks: Path) -> None:
         expand([walks / "no.txt"])
 
 
+def test_hidden_companions_in_a_folder_are_no_recordings(walks: Path) -> None:
+    for companion in ("._a.mcap", "__MACOSX/._b.mcap", ".cache/x.db3"):
+        (walks / companion).parent.mkdir(exist_ok=True)
+        (walks / companion).write_bytes(b"\0\5\x16\7")
+    assert [p.name for p in expand([walks])] == ["a", "b.mcap", "c"]
+
+
 def test_equal_names_get_folders_of_their_own(tmp_path: Path) -> None:
     paths = [tmp_path / one / "walk.mcap" for one in ("x", "y", "x")]
     jobs = plan(paths, job_of(tmp_path, tmp_path / "out"), TopicChoice(), "sum")
