@@ -44,17 +44,17 @@ class ClipTarget:
     @property
     def valid(self) -> Tensor:
         """B x T x H x W bool."""
-        return self.frames.valid.unflatten(0, (-1, self.length))
+        return torch.unflatten(self.frames.valid, 0, (-1, self.length))
 
     @property
     def points(self) -> Tensor:
         """B x T x H x W x 3 metres."""
-        return self.frames.points.unflatten(0, (-1, self.length))
+        return torch.unflatten(self.frames.points, 0, (-1, self.length))
 
     @property
     def weight(self) -> Tensor:
         """B x T x H x W: 1 / z where valid, else 0."""
-        return self.frames.weight().unflatten(0, (-1, self.length))
+        return torch.unflatten(self.frames.weight(), 0, (-1, self.length))
 
 
 def target_from_depth(depth: Tensor, intrinsics: Tensor, aspect: float) -> Target:

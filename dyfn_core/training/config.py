@@ -110,13 +110,32 @@ class DataConfig(BaseModel):
 class RunConfig(Strict):
     """What every run has: data, schedule, bookkeeping.
 
-    data: roots of data sets, or mappings with their root, kind and weight (DataConfig). kinds: of
-    rendered folders. steps: length of the schedule. hours: the schedule ends no
-    later than after so much training time, whatever the step. validation_rgbd: a recording with
-    rgb/, depth/ and K.txt to validate on too. device: "auto" takes the GPU that accelerate gives
-    this process, if any. mixed_precision: of the network; losses are always float32. parts: a
-    batch is computed in so many equal parts, shared out among the processes (default: one each).
-    most_bad_steps: so many in a row may be skipped for a loss or gradient that is not finite.
+    Attributes:
+        data: Roots of data sets, or mappings with their root, kind and weight (DataConfig).
+        kinds: Kinds of rendered folders.
+        stages: Sizes of batches and images, from a step on.
+        steps: Length of the schedule.
+        hours: The schedule ends no later than after this much training time, whatever the step.
+        seed: Of all random draws.
+        threads: Threads of a process.
+        device: "auto" takes the GPU that accelerate gives this process, if any.
+        mixed_precision: Of the network; losses are always float32.
+        parts: A batch is computed in that many equal parts, shared out among the processes;
+            default: one for each process.
+        learning_rate: Highest rate of the cosine schedule.
+        weight_decay: Of AdamW.
+        warmup_steps: Steps in which the rate rises.
+        clip_norm: Largest norm of the gradient.
+        ema_decay: Of the moving average of the parameters, which is what a run exports.
+        most_bad_steps: Steps in a row that may be skipped for a loss or gradient that is not
+            finite.
+        augment_strength: Of the changes of colour, blur and noise; 0 is none, 1 the full range.
+        smallest_view: Smallest side of a crop, relative to the largest that fits into the view.
+        checkpoint_minutes: Time between checkpoints.
+        log_every: Steps between lines of the log.
+        picture_every: Steps between pictures.
+        validate_every: Steps between validations.
+        validation_rgbd: A recording with rgb/, depth/ and K.txt to validate on too.
     """
 
     data: tuple[DataConfig, ...] = Field(min_length=1)
@@ -155,10 +174,20 @@ class RunConfig(Strict):
 class BaseRunConfig(RunConfig):
     """`dyfn-train base`: the small model's encoder and head.
 
-    encoder_rate: the encoder's learning rate relative to the head's. frozen_blocks: the stem and
-    so many encoder blocks keep their ImageNet weights. frozen_depthwise: so do all the encoder's
-    depthwise filters. validation_frames: rendered ones to validate on. model: fields of
-    MiniConfig. initial: a checkpoint to start from instead of ImageNet weights.
+    Attributes:
+        model: Fields of MiniConfig.
+        initial: A checkpoint to start from instead of ImageNet weights.
+        encoder_rate: The encoder's learning rate relative to the head's.
+        frozen_blocks: The stem and this many encoder blocks keep their ImageNet weights.
+        frozen_depthwise: So do all the encoder's depthwise filters.
+        validation_frames: Rendered frames to validate on.
+        local_weight: Of L_local.
+        normal_weight: Of L_normal.
+        normal_stride: Distance of the neighbours that normals are made of, in pixels.
+        mask_weight: Of L_mask.
+        scale_weight: Of the pull towards the true, focal-normalised scale.
+        gradient_weight: Of the differences of the log depth error between neighbours.
+        balls: Balls of L_local a frame, at alpha 1/4 and 1/16.
     """
 
     model: dict[str, Any] = Field(default_factory=dict)

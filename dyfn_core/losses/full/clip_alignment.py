@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from dyfn_core.losses.clip_alignment import check_mode
@@ -39,7 +40,7 @@ def align_clips(
 
     def sample(values: Tensor) -> Tensor:
         chosen = pick(values[:, :frames].flatten(0, 1), index)
-        return chosen.unflatten(0, (-1, frames)).flatten(1, 2)
+        return torch.unflatten(chosen, 0, (-1, frames)).flatten(1, 2)
 
-    seen = seen.unflatten(0, (-1, frames)).flatten(1)
+    seen = torch.unflatten(seen, 0, (-1, frames)).flatten(1)
     return align_samples(sample(points.detach()), sample(target.points), seen, trunc, points.dtype)

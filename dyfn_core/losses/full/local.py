@@ -204,7 +204,7 @@ def _balls(target: Target, level: LocalLevel, frame: Tensor, centre: Tensor) -> 
 def _align_balls(
     predicted: Tensor, true: Tensor, balls: _Balls, resolution: int
 ) -> tuple[Tensor, Tensor]:
-    square = balls.inside.unflatten(1, (balls.side, balls.side))
+    square = torch.unflatten(balls.inside, 1, (balls.side, balls.side))
     index, seen = nearest_valid(square, (resolution, resolution))
     chosen = index[..., None].expand(-1, -1, 3)
     weight = seen / (balls.radius[:, None] + 1e-7)

@@ -89,7 +89,8 @@ def _corner(points: Tensor, down: int, right: int) -> Tensor:
     corner = _quad(points, down, right)
     along_column = _quad(points, 1 - down, right) - corner
     along_row = _quad(points, down, 1 - right) - corner
-    return torch.linalg.cross(along_column, along_row)
+    normals: Tensor = torch.linalg.cross(along_column, along_row)
+    return normals
 
 
 def _quad(values: Tensor, down: int, right: int) -> Tensor:

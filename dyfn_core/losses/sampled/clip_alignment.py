@@ -45,7 +45,8 @@ def align_clips(
 
     def sample(values: Tensor) -> Tensor:
         chosen = values[:, :frames].flatten(0, 1)
-        return pick(chosen, index.expand(len(chosen), -1)).unflatten(0, (-1, frames)).flatten(1, 2)
+        picked = pick(chosen, index.expand(len(chosen), -1))
+        return torch.unflatten(picked, 0, (-1, frames)).flatten(1, 2)
 
     weight = sample(target.weight)
     anchors = torch.multinomial(weight + 1e-9, ANCHORS)

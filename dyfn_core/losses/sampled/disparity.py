@@ -49,7 +49,8 @@ def align_disparity(disparity: Tensor, target: ClipTarget, mode: str) -> tuple[T
 
     def sample(values: Tensor) -> Tensor:
         chosen = values[:, :frames].flatten(0, 1)
-        return pick(chosen, index.expand(len(chosen), -1)).unflatten(0, (-1, frames)).flatten(1)
+        picked = pick(chosen, index.expand(len(chosen), -1))
+        return torch.unflatten(picked, 0, (-1, frames)).flatten(1)
 
     truth, weight = (sample(values) for values in true_disparity(target))
     anchors = torch.multinomial(weight + 1e-9, ANCHORS)

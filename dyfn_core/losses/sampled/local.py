@@ -48,7 +48,7 @@ def local_loss(points: Tensor, target: Target, scale: Tensor, alpha: float, ball
     shape = index.shape
 
     def gather(values: Tensor) -> Tensor:
-        return pick(values, index.flatten(1)).unflatten(1, shape[1:])
+        return torch.unflatten(pick(values, index.flatten(1)), 1, shape[1:])
 
     true, predicted, weights = gather(target.points), gather(points), gather(weight)
     middle = SIDE * SIDE // 2
@@ -62,7 +62,8 @@ def local_loss(points: Tensor, target: Target, scale: Tensor, alpha: float, ball
     aligned = ball_scale[:, None, None] * predicted.flatten(0, 1) + ball_shift[:, None, :]
     error = weights.flatten(0, 1) * (aligned - true.flatten(0, 1)).abs().sum(-1)
     per_ball = error.sum(-1) / counted.sum(-1).clamp(min=1)
-    return torch.where(usable, per_ball, 0.0).sum() / usable.sum().clamp(min=1)
+    loss: Tensor = torch.where(usable, per_ball, 0.0).sum() / usable.sum().clamp(min=1)
+    return loss
 
 
 def _align(predicted: Tensor, true: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

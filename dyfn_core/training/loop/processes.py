@@ -69,12 +69,13 @@ class Processes:
     @property
     def is_main(self) -> bool:
         """Whether this process writes the run's files."""
-        return self.accelerator.is_main_process
+        return bool(self.accelerator.is_main_process)
 
     @property
     def device(self) -> torch.device:
         """Where this process computes."""
-        return self.accelerator.device
+        found: torch.device = self.accelerator.device
+        return found
 
     def wait(self) -> None:
         """Until every process is here."""

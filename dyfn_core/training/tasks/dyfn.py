@@ -80,9 +80,11 @@ class DyFNTask(Task):
         affine = self.model.decode(Latent(latents.flatten(0, 1), half, network_size))
         shape = latents.shape[:2]
         if isinstance(affine, AffineDisparity):
-            return AffineDisparity(affine.disparity.float().unflatten(0, shape))
-        points, mask = affine.points.float(), affine.mask.float()
-        return AffinePoints(points.unflatten(0, shape), mask.unflatten(0, shape))
+            return AffineDisparity(torch.unflatten(affine.disparity.float(), 0, shape))
+        points, mask = (
+            torch.unflatten(part.float(), 0, shape) for part in (affine.points, affine.mask)
+        )
+        return AffinePoints(points, mask)
 
     def validate(self) -> dict[str, float]:
         """Image and video AbsRel with and without DyFN; `score` is the rendered video's.

@@ -90,7 +90,7 @@ class CacheFolder:
         if other:
             raise ConfigError(
                 f"{folder} holds {holds} made with another {', '.join(other)}: "
-                "delete it or give another `cache`"
+                "delete it or give another `method.cache`"
             )
 
     def build(

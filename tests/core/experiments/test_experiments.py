@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,6 +164,45 @@ def test_only_what_is_between_the_markers_changes(tmp_path: Path) -> None:
     path.write_text("<!-- experiment: x -->\n")
     with pytest.raises(ValueError, match="only one of"):
         write_section(path, "x", "new")
+
+
+def test_config_of_an_earlier_version_and_its_runs_are_taken(folder: Path, tmp_path: Path) -> None:
+    """What they were trained with is found again in today's form: nothing is trained twice."""
+    assert run(folder, "effect", "--seeds", "1") == 0
+    out = tmp_path / "out"
+    shutil.copytree(folder / "out", out)
+    (today,) = {
+        path.parents[1]
+        for path in out.glob("runs/*/seed_0/config.yaml")
+        if yaml.safe_load(path.read_text())["dyfn"].get("kind", "convgru") == "convgru"
+    }
+    for other in set(out.glob("runs/*")) - {today}:
+        shutil.rmtree(other)
+    aged = today.rename(today.with_name("of-before"))
+    for path in (aged / "seed_0" / "config.yaml", folder / "config.yaml"):
+        values = yaml.safe_load(path.read_text())
+        method = values.pop("method")
+        objective = method.pop("objective")
+        del method["kind"], objective["kind"]
+        values |= {"stabilizer": values.pop("dyfn"), **method, **objective}
+        (path if path.parent != folder else tmp_path / "config.yaml").write_text(
+            yaml.safe_dump(values)
+        )
+    finished = (aged / "seed_0" / "results.json").stat().st_mtime_ns
+    command = ["experiments", "effect", "--seeds", "1", "--stride", "2", "--out", str(out)]
+    assert main([*command, "--config", str(tmp_path / "config.yaml")]) == 0
+    assert (aged / "seed_0" / "results.json").stat().st_mtime_ns == finished
+    assert list(out.glob("runs/*")) == [aged]
+
+
+def test_default_config_is_found_from_anywhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["experiments", "effect", "--base", "absent.safetensors"]) == 1
+    told = capsys.readouterr().err
+    assert "absent.safetensors" in told
+    assert "no training config" not in told
 
 
 def test_unknown_experiment_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
