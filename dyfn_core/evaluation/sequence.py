@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from dyfn_core.evaluation.report.html import Cell, Table
 from dyfn_core.evaluation.report.pictures import FrameStrip, curves
 from dyfn_core.evaluation.report.worst_frames import WorstFrames
 from dyfn_core.prediction import DEPTH
-from dyfn_core.scoring.frame_scores import FrameScore
+from dyfn_core.scoring.frame_scores import FrameScore, MetricRows
 from dyfn_core.scoring.protocols import (
     CONTROLS,
     SequenceScore,
@@ -37,6 +37,7 @@ COLUMNS = (
 )
 PREDICTION = "prediction"
 CONTROL_SAMPLES = (4_000, 800_000)  # of a frame, and of the sequence
+METRIC_COLUMNS = ("metric_abs_rel", "metric_delta1")  # where depth was in metres
 COUNTS = ("frame", "pixels")  # those of COLUMNS that are integers
 
 
@@ -64,6 +65,7 @@ class SequenceEvaluation:
         self.strip = FrameStrip(expected_frames, quantity=quantity)
         self.worst = WorstFrames(expected_frames, quantity)
         self._stamps, self._latencies = array("d"), array("d")  # seconds
+        self._metric = array("b")
         self._hash = hashlib.sha256()
 
     def push(
@@ -75,18 +77,21 @@ class SequenceEvaluation:
         *,
         stamp: float,
         latency: float,
+        metric: bool = False,
     ) -> FrameScore:
         """One frame.
 
         image: H x W x 3 uint8 RGB. depth: H x W up to scale (or disparity); valid: H x W bool.
         truth: metres, NaN invalid, of the same field of view (any size); None when unknown.
-        stamp, latency: seconds. Raises ValueError when truth has another aspect ratio.
+        stamp, latency: seconds. metric: whether depth is in metres. Raises ValueError when truth
+        has another aspect ratio.
         """
         masked = np.where(valid, depth, np.nan).astype(np.float32)
         self._hash.update(masked.tobytes())
         self.strip.add(len(self._stamps), image, masked, truth)
         self._stamps.append(stamp)
         self._latencies.append(latency)
+        self._metric.append(metric)
         if truth is None:
             nothing = np.full((1, 1), np.nan, np.float32)
             self._scorers.push({PREDICTION: nothing}, nothing)
@@ -119,14 +124,36 @@ class SequenceEvaluation:
         """The sequence under the video protocol."""
         return self.scorer.video()
 
+    @property
+    def metric_frames(self) -> int:
+        """How many frames were in metres."""
+        return sum(self._metric)
+
+    def metric(self) -> MetricRows | None:
+        """Each frame under the metric protocol, None where it was not in metres or not scored.
+
+        None when no frame was in metres, or there is no truth.
+        """
+        score = self.scorer.metric() if self.metric_frames else None
+        if score is None:
+            return None
+        rows = MetricRows()
+        for metrics, known in zip(score.frames, self._metric, strict=True):
+            rows.append(metrics if known else None)
+        return rows
+
     def results(self) -> dict[str, Any]:
-        """What goes into metrics.json: protocols (None without truth), controls, spread."""
+        """What goes into metrics.json: protocols (None without truth), controls, spread.
+
+        The metric protocol is there when frames were in metres; its means are over these.
+        """
         scorer = self.scorer
-        video = self.video()
+        video, metric = self.video(), self.metric()
         return {
             "frames": self.frames,
             "image": _means(scorer.image()),
             "video": _means(video),
+            **({} if metric is None else {"metric": metric.means()}),
             "latency_ms": self.latency_ms(),
             "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
             "coverage": _coverage(scorer),
@@ -138,8 +165,16 @@ class SequenceEvaluation:
             "output_sha256": self.output_hash,
         }
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a table of the frames: COLUMNS, and METRIC_COLUMNS where there are any."""
+        return COLUMNS if self.metric() is None else (*COLUMNS, *METRIC_COLUMNS)
+
     def column(self, name: str) -> np.ndarray:
-        """One of COLUMNS of every frame, float64; NaN where there is no truth."""
+        """One of COLUMNS or METRIC_COLUMNS of every frame, float64.
+
+        NaN where there is no truth, or no depth in metres.
+        """
         scores, video = self.scorer.frames, self.video()
         protocol, _, metric = name.partition("_")
         if name == "frame":
@@ -152,15 +187,19 @@ class SequenceEvaluation:
             return np.full(self.frames, np.nan) if video is None else video.frames.column(metric)
         if protocol == "image":
             return scores.metrics.column(metric)
+        if protocol == "metric":
+            rows = self.metric()
+            return np.full(self.frames, np.nan) if rows is None else rows.column(metric)
         return scores.column(name)
 
     def rows(self) -> Iterator[dict[str, Cell]]:
-        """One dict of COLUMNS per frame; None where there is no truth."""
-        columns = [self.column(name) for name in COLUMNS]
+        """One dict of `columns` per frame; None where there is no value."""
+        names = self.columns
+        columns = [self.column(name) for name in names]
         for values in zip(*columns, strict=True):
             yield {
                 name: int(value) if name in COUNTS else None if np.isnan(value) else float(value)
-                for name, value in zip(COLUMNS, values, strict=True)
+                for name, value in zip(names, values, strict=True)
             }
 
     def draw_strip(self) -> np.ndarray:
@@ -187,24 +226,32 @@ def _coverage(scorer: SequenceScorer) -> float | None:
 
 
 def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
-    """Runs (name -> results()) and, below, the controls of the first, as one table."""
-    header = ("", "image AbsRel", "delta1", "video AbsRel", "delta1", "scale spread", "p50 ms")
+    """Runs (name -> results()) and, below, the controls of the first, as one table.
+
+    The metric protocol has columns where a run was in metres.
+    """
+    protocols = ["image", "video"]
+    if any("metric" in result for result in results.values()):
+        protocols.append("metric")
+    scores = [text for name in protocols for text in (f"{name} AbsRel", "delta1")]
     rows: list[list[Cell]] = []
     for name, result in results.items():
         wandering = (result["spread"] or {}).get("log_scale_std")
         latency = result["latency_ms"] or {}
         p50 = latency.get("p50")
-        rows.append([name, *_scores(result), wandering, None if p50 is None else round(p50, 1)])
+        rows.append([name, *_scores(result, protocols), wandering, _one_digit(p50)])
     for name, control in next(iter(results.values()))["controls"].items():
-        rows.append([f"control: {name}", *_scores(control), None, None])
-    for row in rows:
-        row[-1] = None if row[-1] is None else f"{row[-1]:.1f}"
-    return Table(header, rows)
+        rows.append([f"control: {name}", *_scores(control, protocols), None, None])
+    return Table(("", *scores, "scale spread", "p50 ms"), rows)
 
 
-def _scores(result: Mapping[str, dict[str, float] | None]) -> list[Cell]:
-    image, video = result["image"] or {}, result["video"] or {}
-    return [scores.get(name) for scores in (image, video) for name in ("abs_rel", "delta1")]
+def _one_digit(value: float | None) -> str | None:
+    return None if value is None else f"{value:.1f}"
+
+
+def _scores(result: Mapping[str, Any], protocols: Sequence[str]) -> list[Cell]:
+    found = [result.get(protocol) or {} for protocol in protocols]
+    return [scores.get(name) for scores in found for name in ("abs_rel", "delta1")]
 
 
 def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:

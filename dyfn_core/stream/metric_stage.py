@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -102,9 +103,14 @@ class MetricStage(StreamStage):
         """See StreamStage."""
         return [f"scale: {self.scale.warning}"] if self.scale.warning else []
 
+    @property
+    def unused(self) -> Counter[str]:
+        """How many measurements, or points of them, were not used, by reason."""
+        return self._pairing.dropped + self._metric.calibrator.dropped
+
     def report(self) -> dict[str, str]:
         """See StreamStage."""
         values = {f"scale: {key}": value for key, value in self.scale.described().items()}
-        dropped = self._pairing.dropped + self._metric.calibrator.dropped
-        values.update({f"scale: not used, {k}": str(n) for k, n in sorted(dropped.items())})
+        unused = sorted(self.unused.items())
+        values.update({f"scale: not used, {reason}": str(n) for reason, n in unused})
         return values

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -196,25 +196,34 @@ class StreamOptions:
         return TimeRules(self.stamp_tolerance, self.max_gap)
 
 
-def add_options(parser: argparse.ArgumentParser, kind: type = StreamOptions) -> None:
+def add_options(
+    parser: argparse.ArgumentParser, kind: type = StreamOptions, without: Collection[str] = ()
+) -> dict[str, argparse._ArgumentGroup]:
     """Give a parser the options of a dataclass: `--max-gap` for max_gap, one group a heading.
 
     Args:
         parser: Gets one argument group for each heading.
         kind: A dataclass whose fields were made by `option`, with a default each.
+        without: Fields that the caller adds in its own way.
+
+    Returns:
+        The groups by heading.
 
     Example:
         >>> parser = argparse.ArgumentParser()
-        >>> add_options(parser)
+        >>> groups = add_options(parser)
         >>> options_from(parser.parse_args(["--max-gap", "3"])).max_gap
         3.0
     """
-    groups: dict[str, Any] = {}
+    groups: dict[str, argparse._ArgumentGroup] = {}
     defaults = kind()
     for name, described in options_of(kind).items():
         group = groups.get(described.group)
         if group is None:
-            group = groups[described.group] = parser.add_argument_group(described.group)
+            group = parser.add_argument_group(described.group.lower())
+            groups[described.group] = group
+        if name in without:
+            continue
         default = getattr(defaults, name)
         flag = f"--{name.replace('_', '-')}"
         text = described.description.replace("%", "%%")
@@ -235,6 +244,7 @@ def add_options(parser: argparse.ArgumentParser, kind: type = StreamOptions) -> 
             metavar=None if described.choices else type(default).__name__.upper(),
             help=f"{text} (default: {shown})",
         )
+    return groups
 
 
 def options_from(

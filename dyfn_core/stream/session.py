@@ -124,6 +124,11 @@ class StreamSession:
         """What the depth of the last frame means."""
         return self._metric.scale
 
+    @property
+    def unused_references(self) -> Counter[str]:
+        """How many measurements, or points of them, were not used, by reason."""
+        return self._metric.unused
+
     # Any thread.
 
     def add_reference(self, stamp: float, reference: Reference) -> None:

@@ -122,7 +122,6 @@ def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[st
     parameters = {
         "model": options.model,
         "drop_frames": False,
-        "scene_cut_threshold": 0.0,  # as in dyfn-replay, so that both give the same bytes
         "wait_for_camera_info": first.info is not None,
         "image_transport": "compressed" if first.source.kind == COMPRESSED_IMAGE else "raw",
     }

@@ -72,6 +72,32 @@ def choose_topics(
     )
 
 
+def choose_reference(path: Path, storage: Storage, name: str | None, kind: str) -> str:
+    """The topic of measurements for a metric scale.
+
+    Args:
+        path: The recording, for errors.
+        storage: The same, opened.
+        name: The topic; None: the only one of the type (of images, the only depth image topic).
+        kind: Message type.
+
+    Returns:
+        Its name as recorded.
+
+    Raises:
+        RecordingError: The topic is absent or of another type, or there are several.
+    """
+    kinds = {topic: found.kind for topic, found in storage.topics.items() if found.count}
+    depths = _classify(storage, kinds)[1] if name is None and kind == IMAGE else [*kinds]
+    candidates = sorted(topic for topic in depths if kinds[topic] == kind)
+    found = _named(path, kinds, name, {kind}) or _only(path, kinds, candidates, "reference")
+    if found is None:
+        raise RecordingError(
+            f"{path}: no topic of {kind} for the metric scale; it holds {_listing(kinds, kinds)}"
+        )
+    return found
+
+
 def listed_topics(storage: Storage) -> str:
     """Every topic that holds messages, with its type, for messages to a user."""
     kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
@@ -116,9 +142,10 @@ def _named(path: Path, kinds: dict[str, str], name: str | None, types: set[str])
 
 def _only(path: Path, kinds: dict[str, str], candidates: list[str], what: str) -> str | None:
     if len(candidates) > 1:
+        # There is no reference in training data.
+        key = "" if what == "reference" else f" ({what.replace('-', '_')}_topic in training data)"
         raise RecordingError(
-            f"{path}: several topics may be the {what}; choose one with --{what}-topic "
-            f"({what.replace('-', '_')}_topic in training data): "
+            f"{path}: several topics may be the {what}; choose one with --{what}-topic{key}: "
             f"{_listing(kinds, candidates)}"
         )
     return candidates[0] if candidates else None

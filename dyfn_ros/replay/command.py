@@ -11,7 +11,7 @@ from dyfn_ros.replay.jobs import ALL, EXPECTED_ERRORS, PARTIAL, UNUSABLE, run_jo
 from dyfn_ros.replay.options import Command
 from dyfn_ros.replay.results import results_by_name
 from dyfn_ros.replay.run import ModelLoader, load
-from dyfn_ros.replay.settings import FILES, ReplayJob
+from dyfn_ros.replay.settings import FILES, ReplayJob, Run
 
 INTERRUPTED = 130
 
@@ -38,6 +38,9 @@ def execute(command: Command, loader: ModelLoader | None = None) -> int:
 
 def _execute(command: Command, loader: ModelLoader) -> int:
     if is_many(command.recordings):
+        run = command.job.run
+        if isinstance(run, Run) and run.stream.state_file:
+            raise ValueError("--state-file is for one recording, several were given")
         recordings = expand(command.recordings)
         return replay_all(recordings, command.job, command.topics, command.batch, loader)
     codes = {_replay_and_tell(job, loader) for job in split(command.job, command.topics)}
@@ -56,6 +59,8 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
             times = f" ({count} times)" if count > 1 else ""
             print(f"dyfn-replay: {word}: {text}{times}", file=sys.stderr)
     print(f"{metrics['frames']} frames of {job.source.recording}")
+    for text in metrics.get("state", {}).values():
+        print(f"state: {text}")
     print(text_table(score_table(results_by_name(metrics))))
     written = [name for name in FILES.values() if (folder / name).exists()]
     listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])

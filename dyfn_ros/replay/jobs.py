@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dyfn_core.stream.saving import path_for
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.open import image_topics
 from dyfn_ros.replay.run import ModelLoader, replay
 from dyfn_ros.replay.score_topic import score_topic
-from dyfn_ros.replay.settings import PredictionTopic, ReplayJob, TopicChoice
+from dyfn_ros.replay.settings import PredictionTopic, ReplayJob, Run, TopicChoice
 
 ALL, CRASHED, UNUSABLE, PARTIAL = 0, 1, 2, 3  # exit codes; argparse also ends with 2
 EXPECTED_ERRORS = (RecordingError, ValueError, OSError)  # of input, options and disk
@@ -72,7 +73,7 @@ def outcome_of(job: ReplayJob, loader: ModelLoader) -> Outcome:
 
 
 def split(job: ReplayJob, topics: TopicChoice) -> list[ReplayJob]:
-    """One job per image topic, each with a folder of its own.
+    """One job per image topic, each with a folder and a state file of its own.
 
     Args:
         job: What the jobs share.
@@ -89,13 +90,17 @@ def split(job: ReplayJob, topics: TopicChoice) -> list[ReplayJob]:
         names = [topic for topic in image_topics(job.source.recording) if topic]
     if not names:
         return [job]
-    return [
-        replace(
-            job,
-            source=replace(job.source, image_topic=name),
-            outputs=replace(
-                job.outputs, folder=job.outputs.folder / name.strip("/").replace("/", "_")
-            ),
-        )
-        for name in names
-    ]
+    return [_of_topic(job, name) for name in names]
+
+
+def _of_topic(job: ReplayJob, topic: str) -> ReplayJob:
+    name = topic.strip("/").replace("/", "_")
+    run = job.run
+    if isinstance(run, Run):
+        own = path_for(run.stream.state_file, name, shared=True)
+        run = replace(run, stream=replace(run.stream, state_file=own))
+    return ReplayJob(
+        replace(job.source, image_topic=topic),
+        run,
+        replace(job.outputs, folder=job.outputs.folder / name),
+    )

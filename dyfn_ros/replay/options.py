@@ -12,16 +12,20 @@ from typing import Any
 
 from dyfn_core.argument_types import above_zero, at_least_one
 from dyfn_core.cli.arguments import (
+    Options,
     add_controls,
     add_device,
     add_max_frames,
     add_model,
     add_num_tokens,
+    add_out,
+    add_stabilize,
     add_stride,
     add_threads,
     command_parser,
 )
 from dyfn_core.quantities import DEPTH, QUANTITIES
+from dyfn_core.stream.options import STREAM, add_options, options_from
 from dyfn_ros.replay.settings import (
     DEFAULT,
     FILES,
@@ -31,6 +35,7 @@ from dyfn_ros.replay.settings import (
     PredictionTopic,
     ReplayJob,
     Run,
+    SessionOptions,
     Source,
     TopicChoice,
     parse_outputs,
@@ -41,9 +46,6 @@ EPILOG = (
     "2 nothing usable (the reason is on stderr). Of several recordings or topics: 0 all are whole, "
     "3 some are partial or failed, 2 none gave results."
 )
-
-
-_NEGATED = {"stabilizer": "--no-stabilizer"}  # field -> the option that turns it off
 
 
 @dataclass(frozen=True)
@@ -72,16 +74,17 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     Returns:
         What it asks for.
     """
-    made = parser()
-    given = vars(made.parse_args(arguments))
-    _check(made, given)
+    reader = parser()
+    given = vars(reader.parse_args(arguments))
+    given["num_tokens"] = given["num_tokens"] or 0
     recordings, names = tuple(given["recordings"]), tuple(given["image_topics"])
-    chosen: Run | PredictionTopic = Run(**_of(Run, given))
-    if given["prediction_topic"] is not None:
-        chosen = PredictionTopic(given["prediction_topic"], given["quantity"] or DEPTH)
+    run = Run(stream=options_from(given, SessionOptions), **_of(Run, given))
+    _check(reader, given, run)
+    topic = given["prediction_topic"]
+    scored = None if topic is None else PredictionTopic(topic, given["quantity"] or DEPTH)
     alone = names[0] if len(names) == 1 else None
     source = Source(recording=recordings[0], image_topic=alone, **_of(Source, given))
-    job = ReplayJob(source, chosen, Outputs(**_of(Outputs, given)))
+    job = ReplayJob(source, scored or run, Outputs(given["out"], **_of(Outputs, given)))
     topics = TopicChoice(() if alone else names, given["all_topics"])
     return Command(recordings, job, topics, BatchOptions(**_of(BatchOptions, given)))
 
@@ -91,34 +94,48 @@ def _of(kind: type[Any], given: dict[str, Any]) -> dict[str, Any]:
     return {one.name: given[one.name] for one in fields(kind) if one.name in given}
 
 
-def _check(parser: argparse.ArgumentParser, given: dict[str, Any]) -> None:
+def _check(reader: argparse.ArgumentParser, given: dict[str, Any], run: Run) -> None:
     """Refuse contradictions, and name options that have no effect."""
     if given["image_topics"] and given["all_topics"]:
-        parser.error("--all-topics does not go with --image-topic")
+        reader.error("--all-topics does not go with --image-topic")
+    _check_session(reader, given["reference_topic"], run)
     if given["prediction_topic"] is None:
         if given["quantity"] is not None:
-            parser.error("--quantity describes --prediction-topic, which is not given")
-        if given["compare"] and not given["stabilizer"]:
-            parser.error("--compare has no effect with --no-stabilizer: both runs are the same")
+            reader.error("--quantity describes --prediction-topic, which is not given")
+        if run.compare and not run.stream.stabilize:
+            reader.error("--compare has no effect with --no-stabilize: both runs are the same")
         return
     for name in ("compare", "controls"):
         if given[name]:
-            parser.error(f"--{name} needs a model, and --prediction-topic runs none")
-    names = [one.name for one in fields(Run) if given[one.name] != parser.get_default(one.name)]
-    idle = [_NEGATED.get(name, f"--{name.replace('_', '-')}") for name in names]
+            reader.error(f"--{name} needs a model, and --prediction-topic runs none")
+    names = {one.name for kind in (Run, SessionOptions) for one in fields(kind)} & given.keys()
+    usual = vars(parser().parse_args(["-", "--out", "-"]))
+    usual["num_tokens"] = 0
+    idle = sorted(name for name in names if given[name] != usual[name])
     if idle:
-        text = f"{', '.join(idle)}: no effect with --prediction-topic, which runs no model"
-        print(f"{parser.prog}: warning: {text}", file=sys.stderr)
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in idle)
+        text = f"{options}: no effect with --prediction-topic, which runs no model"
+        print(f"{reader.prog}: warning: {text}", file=sys.stderr)
+
+
+def _check_session(reader: argparse.ArgumentParser, topic: str | None, run: Run) -> None:
+    stream, saved = run.stream, run.load_state or run.save_state
+    if topic is not None and stream.metric_source != "reference":
+        reader.error("--reference-topic has no effect without --metric-source reference")
+    if saved and not stream.state_file:
+        reader.error("--load-state and --save-state need --state-file")
+    if stream.state_file and not saved:
+        reader.error("--state-file has no effect without --load-state or --save-state")
 
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser(
+    made = command_parser(
         "dyfn-replay",
         "Run recordings through the model, as the node would, and score them.",
         EPILOG,
     )
-    parser.add_argument(
+    made.add_argument(
         "recordings",
         type=Path,
         nargs="+",
@@ -126,15 +143,19 @@ def parser() -> argparse.ArgumentParser:
         help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder; several, a folder of them, "
         "or a .txt file that lists them",
     )
-    _add_source(parser.add_argument_group("source", "what is read of a recording"))
-    _add_stream(parser.add_argument_group("stream", "what the stream does, as the node's"))
-    _add_run(parser.add_argument_group("run", "what is run over the frames"))
-    _add_outputs(parser.add_argument_group("outputs", "what is scored and written"))
-    _add_batch(parser.add_argument_group("batch", "how several recordings are replayed"))
-    return parser
+    _add_source(made.add_argument_group("source", "what is read of a recording"))
+    stream = add_options(made, SessionOptions, without=("stabilize", "num_tokens"))[STREAM]
+    stream.description = "the stream's options, with the node's names and defaults"
+    add_stabilize(stream)
+    add_num_tokens(stream)
+    _add_state(stream)
+    _add_run(made.add_argument_group("run", "what is run over the frames"))
+    _add_outputs(made.add_argument_group("outputs", "what is scored and written"))
+    _add_batch(made.add_argument_group("batch", "how several recordings are replayed"))
+    return made
 
 
-def _add_source(group: argparse._ArgumentGroup) -> None:
+def _add_source(group: Options) -> None:
     add = group.add_argument
     add(
         "--image-topic",
@@ -185,25 +206,26 @@ def _add_source(group: argparse._ArgumentGroup) -> None:
         default="header",
         help="times of the messages' headers, or times of recording (default: header)",
     )
+    add(
+        "--reference-topic",
+        metavar="TOPIC",
+        help="measurements for --metric-source reference (default: found by --reference-type)",
+    )
     add_stride(group)
     add_max_frames(group)
 
 
-def _add_stream(group: argparse._ArgumentGroup) -> None:
+def _add_state(group: Options) -> None:
     add = group.add_argument
-    add("--no-stabilizer", dest="stabilizer", action="store_false", help="the base model alone")
-    add_num_tokens(group)
+    add("--load-state", action="store_true", help="go on from the state in --state-file")
     add(
-        "--scene-cut-threshold",
-        type=above_zero,
-        default=0.0,
-        metavar="DIFFERENCE",
-        help="reset the stream at scene cuts, as the node does (its default: 0.6); by default do "
-        "not",
+        "--save-state",
+        action="store_true",
+        help="save the state after the last frame to --state-file",
     )
 
 
-def _add_run(group: argparse._ArgumentGroup) -> None:
+def _add_run(group: Options) -> None:
     add = group.add_argument
     add_model(group)
     add_device(group)
@@ -223,16 +245,9 @@ def _add_run(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def _add_outputs(group: argparse._ArgumentGroup) -> None:
+def _add_outputs(group: Options) -> None:
     add = group.add_argument
-    add(
-        "--out",
-        dest="folder",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder for the results",
-    )
+    add_out(group)
     add(
         "--write",
         type=_outputs,
@@ -263,7 +278,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def _add_batch(group: argparse._ArgumentGroup) -> None:
+def _add_batch(group: Options) -> None:
     add = group.add_argument
     add(
         "--jobs",

@@ -3,14 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
+from typing import Any
 
+from dyfn_core.metric.references import Reference
 from dyfn_core.quantities import DEPTH
+from dyfn_ros.messages.references import message_references
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame
 from dyfn_ros.recordings.open import open_recording
-from dyfn_ros.replay.settings import Source
+from dyfn_ros.recordings.reference_topic import ReferenceTopic
+from dyfn_ros.recordings.rgbd_folder import RgbdRecording
+from dyfn_ros.replay.settings import SessionOptions, Source
+
+
+class ReferenceFeed:
+    """The measurements of a recording, each with the first frame that is recorded after it."""
+
+    def __init__(
+        self, topic: ReferenceTopic, decode: Callable[[Any], Reference], is_truth: bool
+    ) -> None:
+        """Begin at the first measurement.
+
+        Args:
+            topic: Where they are.
+            decode: Makes a measurement of a message.
+            is_truth: Whether the scores are of the same topic.
+        """
+        self.topic = topic
+        self.is_truth = is_truth
+        self._decode = decode
+
+    def before(self, frame: RecordedFrame) -> Iterator[tuple[float, Reference]]:
+        """Stamp (seconds) and measurement of what was recorded up to a frame, once each."""
+        for stamp, message in self.topic.until(frame.source.log_ns):
+            yield stamp, self._decode(message)
 
 
 class SourceReader:
@@ -52,9 +80,39 @@ class SourceReader:
         frames = islice(self.recording.frames(), 0, None, self._source.stride)
         return islice(frames, self._source.max_frames)
 
-    def warn(self, reason: str) -> None:
+    def references(self, options: SessionOptions) -> ReferenceFeed | None:
+        """The measurements of the reference topic, from the first on.
+
+        Args:
+            options: Whether there are any, what they are, and where the sensor is.
+
+        Returns:
+            None when the metric source is none that measures.
+
+        Raises:
+            RecordingError: The recording has no such topic.
+            ValueError: An option of the reference is wrong.
+        """
+        source = self._source
+        if options.metric_source != "reference":
+            return None
+        if isinstance(self.recording, RgbdRecording):
+            raise RecordingError(
+                f"{source.recording}: metric_source is 'reference', expected a recording with a "
+                f"topic of {options.reference_type}; an RGB-D folder has none"
+            )
+        kind = f"sensor_msgs/msg/{options.reference_type}"
+        topic = ReferenceTopic(source.recording, source.reference_topic, kind, source.stamps)
+
+        def unreadable(reason: str) -> None:
+            self.recording.notes.losses[f"{topic.name}: measurement skipped: {reason}"] += 1
+
+        is_truth = topic.name == self.recording.topics.depth
+        return ReferenceFeed(topic, message_references(options, unreadable), is_truth)
+
+    def warn(self, reason: str, times: int = 1) -> None:
         """Note data that is there but could not be used."""
-        self.recording.notes.warnings[reason] += 1
+        self.recording.notes.warnings[reason] += times
 
     def require(self, frames: int) -> None:
         """Check that something was read.

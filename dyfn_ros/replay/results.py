@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from dyfn_core.evaluation.report.html import Section, Table, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
-from dyfn_core.evaluation.sequence import COLUMNS, SequenceEvaluation
+from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.files import finished_file
 from dyfn_core.scoring.protocols import CONTROLS
 from dyfn_ros.recordings.frames import Recording
@@ -37,6 +37,7 @@ class Result:
         base: Of the same frames without DyFN; None: not run.
         options: What the run adds to the `options` of metrics.json.
         cloud: Picture of the fused cloud, H x W x 3 uint8 RGB; None: no cloud.
+        stream: What metrics.json has of the stream session.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Result:
     base: SequenceEvaluation | None
     options: dict[str, Any]
     cloud: np.ndarray | None
+    stream: dict[str, Any] = field(default_factory=dict)
 
 
 def write_results(
@@ -88,6 +90,7 @@ def _metrics(
         "quantity": result.evaluation.quantity,
         **results,
         **({} if result.base is None else {"base": result.base.results()}),
+        **result.stream,
         "recording": {
             "path": str(source.recording),
             "topics": vars(recording.topics),
@@ -108,7 +111,7 @@ def _metrics(
 
 def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
+        writer = csv.DictWriter(file, evaluation.columns)
         writer.writeheader()
         writer.writerows(evaluation.rows())
 
@@ -123,6 +126,9 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
         ["valid share of the pixels with truth", metrics["coverage"]],
         ["output SHA-256", metrics["output_sha256"][:16]],
         *([topic, value] for topic, value in recording["topics"].items()),
+        *([f"resets, {reason}", count] for reason, count in metrics.get("resets", {}).items()),
+        *([f"metric scale, {k}", v] for k, v in metrics.get("metric_scale", {}).items()),
+        *([f"state {what}", text] for what, text in metrics.get("state", {}).items()),
         *([name, value] for name, value in metrics["options"].items() if value is not None),
     ]
     notes = recording["losses"] | recording["warnings"]

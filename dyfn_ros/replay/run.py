@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
@@ -17,7 +17,7 @@ from dyfn_core.threads import computing_threads
 from dyfn_ros.replay.outputs import ReplayOutputs
 from dyfn_ros.replay.reader import SourceReader
 from dyfn_ros.replay.results import Result, write_results
-from dyfn_ros.replay.runner import stream_frames
+from dyfn_ros.replay.runner import StreamRunner
 from dyfn_ros.replay.scores import push_frame
 from dyfn_ros.replay.settings import Outputs, Run, Source
 from dyfn_ros.replay.video import Alignment
@@ -57,30 +57,44 @@ def replay(
     reader = SourceReader(source)
     outputs.folder.mkdir(parents=True, exist_ok=True)
     model = loader(run.model, run.device)
-    stabilized = run.stabilizer and model.stabilizer is not None
+    stabilized = run.stream.stabilize and model.stabilizer is not None
     with computing_threads(run.threads) as threads:
+        runner = StreamRunner(run, model, reader.references(run.stream))
         files = ReplayOutputs(outputs, source.recording, reader.warn)
-        evaluation = _evaluate(reader, run, model, outputs, files)
+        evaluation = _evaluate(reader, runner, model, outputs, files)
         reader.require(evaluation.frames)
+        runner.finish()
         base = None
         if run.compare and stabilized:
-            base = _evaluate(SourceReader(source), replace(run, stabilizer=False), model, outputs)
+            base = _variant(source, run.without_dyfn(), model, outputs)
         elif run.compare:
             reader.warn(f"--compare: {run.model} ran without DyFN, there is nothing to compare")
         if run.controls:
             evaluation.controls |= _controls(source, run, model, outputs)
-    options = {
-        "num_tokens": run.num_tokens,
-        "scene_cut_threshold": run.scene_cut_threshold,
-        "threads": threads,
-    }
-    result = Result(run.model, stabilized, evaluation, base, options, files.cloud)
+    if run.load_state and (base is not None or run.controls):
+        reader.warn("--load-state: base model and controls started without the saved state")
+    options = {**stream_facts(run), "threads": threads}
+    facts = runner.facts()
+    result = Result(run.model, stabilized, evaluation, base, options, files.cloud, facts)
     return write_results(source, reader.recording, outputs, result)
+
+
+def stream_facts(run: Run) -> dict[str, Any]:
+    """What the `options` of metrics.json have of a run; null where the model or nothing decides."""
+    options = asdict(run.stream)
+    del options["stabilize"]  # a key of its own
+    return {
+        **options,
+        "num_tokens": run.stream.num_tokens or None,
+        "state_file": run.stream.state_file or None,
+        "reference_transform": run.stream.reference_transform or None,
+        "device": run.device,
+    }
 
 
 def _evaluate(
     reader: SourceReader,
-    run: Run,
+    runner: StreamRunner,
     model: GeometryModel,
     outputs: Outputs,
     files: ReplayOutputs | None = None,
@@ -95,7 +109,7 @@ def _evaluate(
         disable=not outputs.progress,
     )
     with files or nullcontext():
-        for one in stream_frames(run, model, frames):
+        for one in runner.frames(frames):
             # Disparity is aligned as such, also where its inverse is too far to be depth.
             score = push_frame(
                 evaluation,
@@ -104,14 +118,34 @@ def _evaluate(
                 one.prediction.aligned_quantity,
                 one.stamp,
                 one.latency,
+                one.prediction.metric,
             )
             if files is not None:
                 files.write(one.frame, one.prediction, score)
         if files is not None:
-            video, quantity = evaluation.video(), model.quantity
-            alignment = None if video is None else Alignment(video.scale, video.shift, quantity)
-            files.finish(alignment, quantity)
+            files.finish(_alignment(evaluation), model.quantity)
+    for loss, count in runner.losses().items():
+        reader.recording.notes.losses[loss] += count
+    for warning, count in runner.warnings().items():
+        reader.warn(warning, count)
     return evaluation
+
+
+def _alignment(evaluation: SequenceEvaluation) -> Alignment | None:
+    """What brings all frames into metres: the truth's alignment, else their own scale."""
+    video = evaluation.video()
+    if video is not None:
+        return Alignment(video.scale, video.shift, evaluation.quantity)
+    return Alignment() if evaluation.metric_frames == evaluation.frames else None
+
+
+def _variant(
+    source: Source, run: Run, model: GeometryModel, outputs: Outputs
+) -> SequenceEvaluation:
+    """The same frames in another run; nothing but its evaluation is kept."""
+    reader = SourceReader(source)
+    runner = StreamRunner(run, model, reader.references(run.stream))
+    return _evaluate(reader, runner, model, outputs)
 
 
 def _controls(
@@ -121,7 +155,6 @@ def _controls(
     found = {}
     for name, control in latent_controls(model).items():
         with stabilized_by(model, control):
-            controlled = replace(run, stabilizer=True)
-            evaluation = _evaluate(SourceReader(source), controlled, model, outputs)
+            evaluation = _variant(source, run.with_dyfn(), model, outputs)
         found[name] = evaluation.scorer
     return found

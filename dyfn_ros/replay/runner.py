@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dyfn_core.prediction import Frame, Prediction
-from dyfn_core.stream.options import StreamOptions
 from dyfn_core.stream.session import StreamSession
 from dyfn_ros.recordings.frames import RecordedFrame
+from dyfn_ros.replay.reader import ReferenceFeed
 from dyfn_ros.replay.settings import Run
 
 if TYPE_CHECKING:
@@ -36,30 +37,82 @@ class RunFrame:
     latency: float
 
 
-def stream_frames(
-    run: Run, model: GeometryModel, frames: Iterable[RecordedFrame]
-) -> Iterator[RunFrame]:
-    """Push frames into one stream session, one at a time.
+class StreamRunner:
+    """One stream session over the frames of a recording."""
 
-    Args:
-        run: The stream's options.
-        model: As load_model returns it.
-        frames: In order.
+    def __init__(self, run: Run, model: GeometryModel, references: ReferenceFeed | None) -> None:
+        """Start the session; a saved state is loaded.
 
-    Yields:
-        Each frame with its output.
-    """
-    options = StreamOptions(
-        stabilize=run.stabilizer,
-        num_tokens=run.num_tokens or 0,
-        scene_cut_threshold=run.scene_cut_threshold,
-    )
-    session = StreamSession(model, options)
-    for frame in frames:
-        start = time.perf_counter()
-        seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
-        stamp = seconds + nanoseconds * 1e-9
-        prediction = session.push(
-            Frame(frame.image, stamp, frame.camera_matrix, frame.visible, frame_id=frame.frame_id)
-        )
-        yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
+        Args:
+            run: The options.
+            model: As load_model returns it.
+            references: Measurements for the metric scale; None: there are none.
+
+        Raises:
+            ValueError: An option is wrong, or the state does not fit (StateError).
+        """
+        self._run, self._references = run, references
+        self._session = StreamSession(model, run.stream)
+        self._state: dict[str, str] = {}
+        if run.save_state:
+            _check_folder(run.stream.state_file)
+        if run.load_state:
+            self._state["loaded"] = self._session.load()
+
+    def frames(self, frames: Iterable[RecordedFrame]) -> Iterator[RunFrame]:
+        """Push frames, one at a time.
+
+        Args:
+            frames: In order.
+
+        Yields:
+            Each frame with the session's output.
+        """
+        for frame in frames:
+            start = time.perf_counter()
+            seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
+            stamp = seconds + nanoseconds * 1e-9
+            if self._references is not None:
+                for when, reference in self._references.before(frame):
+                    self._session.add_reference(when, reference)
+            prediction = self._session.push(
+                Frame(
+                    frame.image, stamp, frame.camera_matrix, frame.visible, frame_id=frame.frame_id
+                )
+            )
+            yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
+
+    def finish(self) -> None:
+        """Save the state, if that is asked for. Raises StateError."""
+        if self._run.save_state:
+            self._state["saved"] = self._session.save()
+
+    def facts(self) -> dict[str, Any]:
+        """What metrics.json has of the session: resets, metric scale, saved state."""
+        found: dict[str, Any] = {"resets": dict(self._session.resets)}
+        if self._run.stream.metric_source != "none":
+            found["metric_scale"] = self._session.scale.described()
+        return {**found, **({"state": self._state} if self._state else {})}
+
+    def warnings(self) -> dict[str, int]:
+        """What a user should look at, with how often."""
+        found = dict.fromkeys(self._session.problems(), 1)
+        if self._references is None:
+            return found
+        topic = self._references.topic.name
+        if self._references.is_truth:
+            found[f"{topic} is both the reference and the ground truth of the scores"] = 1
+        for reason, count in sorted(self._session.unused_references.items()):
+            found[f"{topic}: measurements or points not used: {reason}"] = count
+        return found
+
+    def losses(self) -> dict[str, int]:
+        """Measurements that could not be read, with how often."""
+        return {} if self._references is None else dict(self._references.topic.losses)
+
+
+def _check_folder(state_file: str) -> None:
+    """A long run must not end with a state that cannot be saved."""
+    folder = Path(state_file).expanduser().parent
+    if not folder.is_dir():
+        raise ValueError(f"state_file is {state_file!r}, but {folder} is no folder")

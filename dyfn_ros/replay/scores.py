@@ -18,6 +18,7 @@ def push_frame(
     predicted: tuple[np.ndarray, np.ndarray],
     stamp: float,
     latency: float,
+    metric: bool = False,
 ) -> FrameScore:
     """Score one frame.
 
@@ -28,6 +29,7 @@ def push_frame(
         predicted: H x W depth or disparity, and H x W bool where it is valid.
         stamp: Seconds.
         latency: Seconds that the prediction took.
+        metric: Whether the prediction is in metres.
 
     Returns:
         The frame's score under the image protocol.
@@ -36,6 +38,8 @@ def push_frame(
         RecordingError: The ground truth shows another field of view than the image.
     """
     try:
-        return evaluation.push(frame.image, *predicted, frame.depth, stamp=stamp, latency=latency)
+        return evaluation.push(
+            frame.image, *predicted, frame.depth, stamp=stamp, latency=latency, metric=metric
+        )
     except ValueError as error:
         raise RecordingError(f"{reader.recording.topics.depth}: {error}") from error

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from dyfn_core.quantities import DEPTH
+from dyfn_core.stream.options import StreamOptions
 from dyfn_core.threads import THREADS
+from dyfn_ros.messages.reference_options import ReferenceOptions
 
 MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
 FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}
@@ -33,6 +35,7 @@ class Source:
         depth_topic: Ground truth; None: found by type, "none": no scores.
         depth_info_topic: CameraInfo of a depth camera that is not the image's.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
+        reference_topic: Measurements for metric_source "reference"; None: found by type.
         stamps: Times of the headers, or of the log.
         tolerance: Seconds between the stamps of an image and its ground truth.
         stride: Every N-th frame is read.
@@ -45,10 +48,16 @@ class Source:
     depth_topic: str | None = None
     depth_info_topic: str | None = None
     depth_transform: str | None = None
+    reference_topic: str | None = None
     stamps: Literal["header", "log"] = "header"
     tolerance: float = 0.02
     stride: int = 1
     max_frames: int | None = None
+
+
+@dataclass(frozen=True)
+class SessionOptions(ReferenceOptions, StreamOptions):
+    """The node's options of a stream and of its reference, with the node's defaults."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +68,9 @@ class Run:
         model: Bundled name, checkpoint file or Hub id.
         device: "auto" (a GPU if there is one), "cpu", "cuda" or "cuda:N".
         threads: CPU threads of inference; 0: torch's own choice.
-        stabilizer: With DyFN; False: the base model alone.
-        num_tokens: Resolution inside the model; None: the model's own.
-        scene_cut_threshold: Difference of two images above which the stream resets; 0: never.
+        stream: The stream session's options.
+        load_state: Go on from stream.state_file.
+        save_state: Leave the state after the last frame in stream.state_file.
         compare: Also run the base model, for one report on both.
         controls: Also run DyFN's controls (models.controls.latent_controls).
     """
@@ -69,11 +78,23 @@ class Run:
     model: str = "dyfn-mini"
     device: str = "auto"
     threads: int = THREADS
-    stabilizer: bool = True
-    num_tokens: int | None = None
-    scene_cut_threshold: float = 0.0
+    stream: SessionOptions = SessionOptions()
+    load_state: bool = False
+    save_state: bool = False
     compare: bool = False
     controls: bool = False
+
+    def without_dyfn(self) -> Run:
+        """The same run of the base model; a saved state is DyFN's and stays out of it."""
+        return self._variant(stabilize=False)
+
+    def with_dyfn(self) -> Run:
+        """The same run with DyFN, or what stands in its place, and without a saved state."""
+        return self._variant(stabilize=True)
+
+    def _variant(self, stabilize: bool) -> Run:
+        stream = replace(self.stream, stabilize=stabilize)
+        return replace(self, stream=stream, load_state=False, save_state=False)
 
 
 @dataclass(frozen=True)

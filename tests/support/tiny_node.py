@@ -1,4 +1,4 @@
-"""stream_depth with the tiny model, as a process of its own."""
+"""stream_depth with the tiny model (or "pinhole"), as a process of its own."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ if TYPE_CHECKING:
 
 
 def load(name: str, device: str) -> GeometryModel:
+    from tests.support.pinhole import PinholeModel
     from tests.support.tiny_model import load_tiny
 
-    return load_tiny(name, device)
+    return PinholeModel().eval() if name == "pinhole" else load_tiny(name, device)
 
 
 def report(name: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import math
 import signal
 from collections.abc import Callable, Iterator
@@ -14,12 +13,13 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.clouds import cloud_points
+from tests.support.points import cloud_message
 from tests.support.ros_graph import (
     NODE,
     RELIABLE,
@@ -91,17 +91,6 @@ def call(client: Client, name: str) -> Trigger.Response:
 def value(bench: Bench, key: str) -> str:
     """Of the last scale status."""
     return next(v.value for v in bench.statuses[-1].values if v.key == key)
-
-
-def cloud_message(points: np.ndarray, stamp: tuple[int, int]) -> PointCloud2:
-    fields = [
-        PointField(name=axis, offset=4 * i, datatype=7, count=1) for i, axis in enumerate("xyz")
-    ]
-    message = PointCloud2(height=1, width=len(points), fields=fields, point_step=12)
-    message.row_step = 12 * len(points)
-    message.data = array.array("B", points.astype("<f4").tobytes())
-    message.header.stamp.sec, message.header.stamp.nanosec = stamp
-    return message
 
 
 def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
