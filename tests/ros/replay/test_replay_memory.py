@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dyfn_core.evaluation import sequence
 from dyfn_core.evaluation.report import worst_frames
 from dyfn_core.geometry import voxel_grid
 from dyfn_core.scoring import protocols
@@ -58,7 +59,7 @@ def peak(folder: Path, count: int) -> int:
 def test_peak_memory_does_not_depend_on_the_number_of_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(protocols, "SequenceScorer", FewSamples)
+    monkeypatch.setattr(sequence, "SequenceScorer", FewSamples)
     monkeypatch.setattr(voxel_grid, "_PENDING", 10_000)
     monkeypatch.setattr(worst_frames, "WIDTH", 16)  # at most 30 pictures, but not always as many
     peak(tmp_path, 2)  # what is loaded once
