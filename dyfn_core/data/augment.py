@@ -98,7 +98,8 @@ def apply_crop(
 def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     """4 x 4 of the mirrored camera in the mirrored world (x becomes -x in both)."""
     signs = np.array([-1.0, 1, 1, 1])
-    return pose * signs[:, None] * signs
+    result: np.ndarray = pose * signs[:, None] * signs
+    return result
 
 
 def draw_appearance(rng: np.random.Generator, strength: float = 1.0) -> Appearance:
@@ -201,7 +202,8 @@ def _colour_matrix(hue: float, saturation: float) -> np.ndarray:
     turn = np.cos(hue) * np.eye(3) + np.sin(hue) * cross
     turn += (1 - np.cos(hue)) * np.outer(axis, axis)
     grey = np.tile(LUMA, (3, 1))
-    return ((saturation * np.eye(3) + (1 - saturation) * grey) @ turn).astype(np.float32)
+    mixed: np.ndarray = (saturation * np.eye(3) + (1 - saturation) * grey) @ turn
+    return mixed.astype(np.float32)
 
 
 def _motion_kernel(rng: np.random.Generator) -> np.ndarray:
@@ -212,4 +214,5 @@ def _motion_kernel(rng: np.random.Generator) -> np.ndarray:
     reach = np.array([np.cos(angle), np.sin(angle)]) * centre
     start, end = np.round(centre - reach).astype(int), np.round(centre + reach).astype(int)
     cv2.line(kernel, start.tolist(), end.tolist(), 1.0)
-    return kernel / kernel.sum()
+    result: np.ndarray = kernel / kernel.sum()
+    return result

@@ -77,7 +77,8 @@ class Clip:
     @property
     def valid(self) -> np.ndarray:
         """T x h x w bool: where the depth is known and finite."""
-        return np.isfinite(self.depth) & (self.depth > 0)
+        result: np.ndarray = np.isfinite(self.depth) & (self.depth > 0)
+        return result
 
     @property
     def infinite(self) -> np.ndarray:

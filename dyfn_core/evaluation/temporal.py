@@ -51,7 +51,8 @@ def reprojection_error(
 
 
 def _valid(depth: np.ndarray) -> np.ndarray:
-    return np.isfinite(depth) & (depth > 0)
+    result: np.ndarray = np.isfinite(depth) & (depth > 0)
+    return result
 
 
 def _moved(
@@ -112,7 +113,7 @@ def static_pixels(
     """
     valid = _valid(first) & _valid(second)
     with np.errstate(invalid="ignore", divide="ignore"):
-        static = valid & (np.abs(second - first) <= SAME_DEPTH * first)
+        static: np.ndarray = valid & (np.abs(second - first) <= SAME_DEPTH * first)
     if views is not None:
         v, u = np.nonzero(static)
         _, pixels = _project(u, v, first[v, u].astype(np.float64), *views)
@@ -247,7 +248,7 @@ def _on_grid(
 ) -> np.ndarray:
     """A camera matrix in pixels of the image -> in points of the grid on the truth."""
     step, start = grid[0].step, grid[0].start
-    result = matrix.astype(np.float64).copy()
+    result: np.ndarray = matrix.astype(np.float64).copy()
     for row, axis in ((0, 1), (1, 0)):
         scale = shape[axis] / image_shape[axis]
         result[row] *= scale

@@ -238,7 +238,8 @@ class _Objective:
         a, b = c @ self.along[::step], (c * c) @ self.square[::step]
         if self.known is not None:
             scale = self.known * q
-            return scale * (scale * b - 2 * a)
+            result: np.ndarray = scale * (scale * b - 2 * a)
+            return result
         usable = (a > 0) & (b > 0)
         return np.where(usable, -a * a / np.where(usable, b, 1.0), 0.0)
 
@@ -298,4 +299,5 @@ def _illinois(
 
 def valid_depth(depth: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """H x W bool: where depth is finite, in front of the camera, and the model believes in it."""
-    return mask & np.isfinite(depth) & (depth > 0)
+    result: np.ndarray = mask & np.isfinite(depth) & (depth > 0)
+    return result

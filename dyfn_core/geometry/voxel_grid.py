@@ -69,7 +69,8 @@ class VoxelGrid:
 
 def _encode(cells: np.ndarray) -> np.ndarray:
     """N x 3 cells, 0 .. 2 ** _BITS - 1 -> N keys."""
-    return (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
+    result: np.ndarray = (cells[:, 0] << 2 * _BITS) | (cells[:, 1] << _BITS) | cells[:, 2]
+    return result
 
 
 def _decode(keys: np.ndarray) -> np.ndarray:

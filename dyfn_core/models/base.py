@@ -132,7 +132,8 @@ class GeometryModel(nn.Module, ABC):
         """features B x C x h x w, previous state -> stabilized features, next state."""
         if self.stabilizer is None:
             return features, None
-        return self.stabilizer(features, state)
+        result: tuple[Tensor, StreamState | None] = self.stabilizer(features, state)
+        return result
 
     def stabilize_latent(
         self, latent: Latent, state: StreamState | None

@@ -32,7 +32,8 @@ class PatchEmbedding(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """image: H and W multiples of 14."""
-        return self.proj(image).flatten(2).transpose(1, 2)
+        result: Tensor = self.proj(image).flatten(2).transpose(1, 2)
+        return result
 
 
 class Attention(nn.Module):
@@ -49,7 +50,8 @@ class Attention(nn.Module):
         qkv = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         query, key, value = qkv.unbind(0)
         attended = F.scaled_dot_product_attention(query, key, value)
-        return self.proj(attended.transpose(1, 2).flatten(2))
+        result: Tensor = self.proj(attended.transpose(1, 2).flatten(2))
+        return result
 
 
 class FeedForward(nn.Module):
@@ -62,7 +64,8 @@ class FeedForward(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""
-        return self.fc2(F.gelu(self.fc1(x)))
+        result: Tensor = self.fc2(F.gelu(self.fc1(x)))
+        return result
 
 
 class LayerScale(nn.Module):
@@ -92,7 +95,8 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """x: B x N x C."""
         x = x + self.ls1(self.attn(self.norm1(x)))
-        return x + self.ls2(self.mlp(self.norm2(x)))
+        result: Tensor = x + self.ls2(self.mlp(self.norm2(x)))
+        return result
 
 
 class DinoV2(nn.Module):

@@ -23,7 +23,8 @@ class ResidualConvUnit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x C x h x w."""
-        return self.conv2(F.relu(self.conv1(F.relu(x)))) + x
+        result: Tensor = self.conv2(F.relu(self.conv1(F.relu(x)))) + x
+        return result
 
 
 class FusionBlock(nn.Module):
@@ -40,7 +41,8 @@ class FusionBlock(nn.Module):
         if layer is not None:
             path = path + self.resConfUnit1(layer)
         # A 1 x 1 convolution and the resizing that follows commute; this order is four times less.
-        return self.out_conv(self.resConfUnit2(path))
+        result: Tensor = self.out_conv(self.resConfUnit2(path))
+        return result
 
 
 class Scratch(nn.Module):
@@ -99,7 +101,8 @@ class DPTHead(nn.Module):
         path = resized(scratch.refinenet4(four, None), three.shape[-2:])
         path = resized(scratch.refinenet3(path, three), two.shape[-2:])
         path = resized(scratch.refinenet2(path, two), one.shape[-2:])
-        return scratch.refinenet1(path, one)
+        result: Tensor = scratch.refinenet1(path, one)
+        return result
 
     def forward(self, latent: Tensor, size: tuple[int, int]) -> Tensor:
         """latent B x C x 4h x 4w -> disparity B x 1 x H x W >= 0 at the network's size."""

@@ -106,7 +106,8 @@ class Block(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         out = x if self.expand is None else F.relu6(self.expand(x), inplace=True)
         out = self.project(F.relu6(self.depthwise(out), inplace=True))
-        return x + out if self.has_skip else out
+        result: Tensor = x + out if self.has_skip else out
+        return result
 
 
 class EfficientNetLite0(nn.Module):

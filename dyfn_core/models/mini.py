@@ -80,7 +80,8 @@ class MiniResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         inner = self.first(F.leaky_relu(self.norm(x), SLOPE))
-        return x + self.second(F.leaky_relu(self.norm_second(inner), SLOPE))
+        result: Tensor = x + self.second(F.leaky_relu(self.norm_second(inner), SLOPE))
+        return result
 
 
 class ContextLayer(nn.Module):
@@ -109,7 +110,8 @@ class ContextLayer(nn.Module):
         mixed = F.scaled_dot_product_attention(q, k, v)
         tokens = tokens + self.out(mixed.transpose(1, 2).reshape(batch, -1, channels))
         tokens = tokens + self.mlp(self.norm_mlp(tokens))
-        return tokens.transpose(1, 2).reshape(batch, channels, height, width)
+        result: Tensor = tokens.transpose(1, 2).reshape(batch, channels, height, width)
+        return result
 
 
 class Neck(nn.Module):

@@ -83,7 +83,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x: B x C x h x w."""
-        return self.layers(x) + x
+        result: Tensor = self.layers(x) + x
+        return result
 
 
 class Head(nn.Module):
@@ -102,12 +103,13 @@ class Head(nn.Module):
 
     def fuse(self, layers: list[Tensor]) -> Tensor:
         """Encoder layers, each B x C x h x w -> the latent F, B x dim_proj x h x w."""
-        first, *others = (
+        projected: list[Tensor] = [
             project(layer) for project, layer in zip(self.projects, layers, strict=True)
-        )
+        ]
+        latent, *others = projected
         for other in others:
-            first = first + other
-        return first
+            latent = latent + other
+        return latent
 
     def forward(self, latent: Tensor, network_size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """latent B x C x h x w -> raw points B x 3 x H x W, raw mask B x 1 x H x W."""

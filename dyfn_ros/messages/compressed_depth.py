@@ -45,7 +45,8 @@ def decode_compressed_depth(message: Any) -> np.ndarray:
         with np.errstate(divide="ignore"):
             metres = (inverse[0] / (values.astype(np.float32) - inverse[1])).astype(np.float32)
     valid = (values > 0) & np.isfinite(metres) & (metres > 0)
-    return np.where(valid, metres, np.float32(np.nan))
+    result: np.ndarray = np.where(valid, metres, np.float32(np.nan))
+    return result
 
 
 INVERSE_RESOLUTION = 100.0  # as compressed_depth_image_transport: depth_quantization

@@ -246,7 +246,7 @@ def decode_metric_depth(raster: Raster, *, zero: bool = False) -> np.ndarray:
         )
     _check_size(raster)
     if raster.encoding == "32FC1":
-        depth = _rows(raster, "f4", 1)[..., 0].copy()
+        depth: np.ndarray = _rows(raster, "f4", 1)[..., 0].copy()
         valid = depth >= 0 if zero else depth > 0
     else:
         depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32) * np.float32(0.001)

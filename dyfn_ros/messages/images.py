@@ -80,7 +80,7 @@ def _thousandths(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(rounded <= 65535, rounded, 0).astype("<u2")
 
 
-def _ros_bytes(values: np.ndarray) -> array.array:
+def _ros_bytes(values: np.ndarray) -> array.array[int]:
     """Only an array.array is taken over by rclpy without a look at every element."""
     data = array.array("B")
     data.frombytes(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)

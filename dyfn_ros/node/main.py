@@ -40,9 +40,8 @@ def _autostart(node: StreamDepthNode) -> bool:
     """Configure and activate. -> whether that worked; the node has said why if not."""
     success = TransitionCallbackReturn.SUCCESS
     try:
-        return all(
-            change() == success for change in (node.trigger_configure, node.trigger_activate)
-        )
+        configured = node.trigger_configure() == success
+        return bool(configured and node.trigger_activate() == success)
     except RuntimeError:  # the state machine cannot publish into a context that has ended
         if node.context.ok():
             raise

@@ -51,14 +51,16 @@ class PoseTrack:
         stamps, poses = self._in_order()
         after = int(np.searchsorted(stamps, stamp_ns))
         if after < len(stamps) and stamps[after] == stamp_ns:
-            return poses[after]
+            exact: np.ndarray = poses[after]
+            return exact
         if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP * 1e9:
             return _between(poses[after - 1], poses[after], stamps[after - 1 : after + 1], stamp_ns)
         beside = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
         nearest = min(beside, key=lambda i: abs(int(stamps[i]) - stamp_ns), default=None)
         if nearest is None or abs(int(stamps[nearest]) - stamp_ns) > TOLERANCE * 1e9:
             return None
-        return poses[nearest]
+        alone: np.ndarray = poses[nearest]
+        return alone
 
     def _in_order(self) -> tuple[np.ndarray, np.ndarray]:
         if self._sorted is None:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from dyfn_core.prediction import Prediction
-from dyfn_core.scoring.protocols import FrameScore, sample_grid
+from dyfn_core.scoring.frame_scores import FrameScore
+from dyfn_core.scoring.protocols import sample_grid
 from dyfn_ros.messages.clouds import CLOUD_OFFSETS, CLOUD_STEP, pack_cloud
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.recordings.open import RecordedFrame

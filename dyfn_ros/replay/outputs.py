@@ -12,7 +12,7 @@ import numpy as np
 
 from dyfn_core.files import cannot_write
 from dyfn_core.prediction import DEPTH, Prediction
-from dyfn_core.scoring.protocols import FrameScore
+from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.recordings.poses import PoseError, PoseLookup, open_poses
 from dyfn_ros.replay.cloud import write_cloud

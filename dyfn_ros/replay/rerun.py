@@ -11,7 +11,7 @@ import numpy as np
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.files import OutputError
 from dyfn_core.prediction import Prediction
-from dyfn_core.scoring.protocols import FrameScore
+from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.replay.mcap import score_values, subsampled
 

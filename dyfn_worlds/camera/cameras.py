@@ -44,14 +44,17 @@ class FreeSpace:
         """N x 3 -> N metres to the nearest surface along PROBES fixed directions."""
         directions = np.tile(_sphere(PROBES), (len(points), 1))
         origins = np.repeat(points, PROBES, axis=0)
-        return self.distance(origins, directions).reshape(len(points), PROBES).min(axis=1)
+        distances = self.distance(origins, directions).reshape(len(points), PROBES)
+        nearest: np.ndarray = distances.min(axis=1)
+        return nearest
 
     def sees(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """N x 3 pairs -> whether the straight way from start to end is free."""
         step = end - start
         length = np.linalg.norm(step, axis=1)
         unit = step / np.maximum(length, 1e-9)[:, None]
-        return self.distance(start, unit) >= length
+        result: np.ndarray = self.distance(start, unit) >= length
+        return result
 
     def sample_point(self, rng: np.random.Generator, heights: tuple[float, float]) -> np.ndarray:
         """A point in free space, heights[0]..heights[1] metres above what lies below it."""
@@ -64,7 +67,7 @@ class FreeSpace:
             floor = self.distance(point[None], np.array([[0, 0, -1.0]]))[0]
             if floor >= FAR / 2:
                 continue
-            lifted = point + np.array([0, 0, rng.uniform(*heights) - floor])
+            lifted: np.ndarray = point + np.array([0, 0, rng.uniform(*heights) - floor])
             free = self.sees(point[None], lifted[None])[0]
             if free and self.clearance(lifted[None])[0] > CLEARANCE:
                 return lifted

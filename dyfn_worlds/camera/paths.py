@@ -137,7 +137,8 @@ def _smooth_noise(rng: np.random.Generator, count: int, knots: int) -> np.ndarra
     index = x.astype(int)
     t = x - index
     fade = t * t * (3 - 2 * t)
-    return values[index] * (1 - fade) + values[index + 1] * fade
+    result: np.ndarray = values[index] * (1 - fade) + values[index + 1] * fade
+    return result
 
 
 def _look_about(

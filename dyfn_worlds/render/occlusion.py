@@ -41,4 +41,5 @@ def occlusion(depth: np.ndarray, focal_px: float) -> np.ndarray:
         slope = nearer / apart
         share = np.clip(slope, 0, 1) * np.clip(2.2 - slope, 0, 1) * np.exp(-apart / REACH)
         total += share
-    return np.clip(total / 3.0, 0, 1)
+    result: np.ndarray = np.clip(total / 3.0, 0, 1)
+    return result

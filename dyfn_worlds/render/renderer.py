@@ -243,7 +243,7 @@ class Renderer:
         self._draw_shadows(self._actor_target, ACTOR_SHADOW_SIZE, shadows)
 
     def _over_sky(self, rgba: np.ndarray, camera: RenderCamera) -> np.ndarray:
-        image = rgba[..., :3].copy()
+        image: np.ndarray = rgba[..., :3].copy()
         empty = rgba[..., 3] == 0
         if empty.any():
             height = len(image)
@@ -345,7 +345,8 @@ def _cosine(light: Light) -> float:
 
 
 def _column_major(matrix: np.ndarray) -> bytes:
-    return matrix.T.astype("f4").tobytes()
+    result: bytes = matrix.T.astype("f4").tobytes()
+    return result
 
 
 def _view_matrix(pose: np.ndarray) -> np.ndarray:
@@ -380,4 +381,6 @@ def _light_matrix(light: Light) -> np.ndarray:
     near = NEAR
     if light.window is not None:
         near += float(((light.window.corners() - light.position) @ forward).max())
-    return _projection_matrix(RenderCamera(pose, (focal, focal)), 40.0, near) @ _view_matrix(pose)
+    projection = _projection_matrix(RenderCamera(pose, (focal, focal)), 40.0, near)
+    result: np.ndarray = projection @ _view_matrix(pose)
+    return result

@@ -25,7 +25,8 @@ class Spot:
     def at(self, x: float, y: float, z: float = 0.0) -> np.ndarray:
         """Local metres -> world."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
-        return np.asarray(self.position) + np.array([c * x - s * y, s * x + c * y, z])
+        result: np.ndarray = np.asarray(self.position) + np.array([c * x - s * y, s * x + c * y, z])
+        return result
 
     def moved(self, x: float, y: float, z: float = 0.0, turn: float = 0.0) -> Spot:
         return Spot(self.builder, self.rng, self.at(x, y, z), self.yaw + turn)

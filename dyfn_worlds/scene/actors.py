@@ -41,7 +41,7 @@ class Actor:
         normals = (1 - share) * self.normals[a] + share * self.normals[b]
         cosine, sine = np.cos(place.yaw), np.sin(place.yaw)
         turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], np.float32)
-        out = self.vertices.copy()
+        out: np.ndarray = self.vertices.copy()
         out["position"] = body @ turn.T + np.asarray(place.position, np.float32)
         out["normal"] = normals @ turn.T
         return out

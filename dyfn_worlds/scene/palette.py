@@ -110,7 +110,8 @@ def _recolored(photo: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> 
         return image
     pattern = image.astype(np.float32) / max(float(image.mean()), 8.0)
     pattern = 1 + (pattern - 1) * rng.uniform(0.3, 1.0)
-    return np.clip(pattern * own.reshape(-1, 3).mean(axis=0), 0, 255).astype(np.uint8)
+    result: np.ndarray = np.clip(pattern * own.reshape(-1, 3).mean(axis=0), 0, 255).astype(np.uint8)
+    return result
 
 
 def _mirrored(image: np.ndarray) -> np.ndarray:

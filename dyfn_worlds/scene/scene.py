@@ -41,12 +41,14 @@ class Window:
     def inward(self) -> np.ndarray:
         """Unit normal, into the room."""
         normal = np.cross(self.up, self.right)
-        return normal / np.linalg.norm(normal)
+        result: np.ndarray = normal / np.linalg.norm(normal)
+        return result
 
     def corners(self) -> np.ndarray:
         """4 x 3."""
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        return self.centre + signs[:, :1] * self.right + signs[:, 1:] * self.up
+        result: np.ndarray = self.centre + signs[:, :1] * self.right + signs[:, 1:] * self.up
+        return result
 
 
 @dataclass(frozen=True)

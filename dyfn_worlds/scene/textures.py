@@ -15,12 +15,14 @@ Color = np.ndarray
 def muted_color(rng: np.random.Generator) -> Color:
     """A colour as paint, cloth and wood have it: seldom saturated. RGB in 0..1."""
     hsv = np.array([[[rng.uniform(0, 360), rng.beta(1.3, 4.0), rng.uniform(0.25, 0.98)]]])
-    return cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0]
+    result: Color = cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0]
+    return result
 
 
 def wood_color(rng: np.random.Generator) -> Color:
     hsv = np.array([[[rng.uniform(15, 38), rng.uniform(0.25, 0.7), rng.uniform(0.3, 0.85)]]])
-    return cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0]
+    result: Color = cv2.cvtColor(hsv.astype(np.float32), cv2.COLOR_HSV2RGB)[0, 0]
+    return result
 
 
 def neutral_color(rng: np.random.Generator) -> Color:

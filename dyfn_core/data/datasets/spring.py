@@ -88,4 +88,5 @@ def _disparity(path: Path) -> np.ndarray:
         raise FrameError(f"{path}: expected HDF5 with the key `disparity`: {error}") from error
     if stored.shape != (2 * SIZE[0], 2 * SIZE[1]):
         raise FrameError(f"{path}: expected {2 * SIZE[0]} x {2 * SIZE[1]}, got {stored.shape}")
-    return stored[::2, ::2].astype(np.float32)
+    result: np.ndarray = stored[::2, ::2].astype(np.float32)
+    return result

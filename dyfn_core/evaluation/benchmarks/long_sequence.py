@@ -159,7 +159,8 @@ def draw_lengths(results: dict[str, Any], title: str) -> np.ndarray:
     figure.suptitle(title, fontsize=11)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    result: np.ndarray = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return result
 
 
 def write_lengths(results: dict[str, Any], folder: Path, title: str) -> None:

@@ -79,7 +79,8 @@ def _pixels(
 ) -> np.ndarray:
     """x right, y up -> columns and rows, N x 2 int."""
     flat = (points[:, :2] - middle) * [scale, -scale] + [size[1] / 2, size[0] / 2]
-    return np.floor(flat).astype(int)
+    result: np.ndarray = np.floor(flat).astype(int)
+    return result
 
 
 def _splat(

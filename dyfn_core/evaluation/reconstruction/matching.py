@@ -180,7 +180,8 @@ def sample_at(values: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         values[below, left] * (1 - a) + values[below, right] * a
     ) * b
     near = values[np.where(b[:, 0] < 0.5, top, below), np.where(a[:, 0] < 0.5, left, right)]
-    found = np.where(np.isfinite(mixed).all(1, keepdims=True), mixed, near).astype(np.float64)
+    known = np.isfinite(mixed).all(1, keepdims=True)
+    found: np.ndarray = np.where(known, mixed, near).astype(np.float64)
     found[~inside] = np.nan
     return found
 

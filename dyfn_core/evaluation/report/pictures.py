@@ -40,7 +40,7 @@ def colour_error(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _paint(name: str, values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     table = (colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
-    painted = table[np.clip(values * 255, 0, 255).astype(np.uint8)]
+    painted: np.ndarray = table[np.clip(values * 255, 0, 255).astype(np.uint8)]
     painted[~valid] = INVALID
     return painted
 
@@ -208,7 +208,8 @@ def curves(
     axes[-1].set_xlabel(x_label, fontsize=9)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    result: np.ndarray = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    return result
 
 
 def encode_picture(image: np.ndarray, suffix: str = ".png", quality: int = 88) -> bytes:

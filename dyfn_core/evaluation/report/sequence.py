@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.evaluation.report.curves import Curves, Histogram
 from dyfn_core.evaluation.report.html import (
     Cell,
-    Curves,
-    Histogram,
     KeyFigures,
     Part,
     Picture,

@@ -9,7 +9,7 @@ import numpy as np
 
 from dyfn_core.evaluation.report.pictures import FrameStrip, Snapshot, snapshot
 from dyfn_core.prediction import DEPTH, DISPARITY
-from dyfn_core.scoring.protocols import FrameScore
+from dyfn_core.scoring.frame_scores import FrameScore
 
 STRETCHES = 24  # a recording is cut into so many; of each at most one frame is called worst
 KEPT = 10  # stretches a reason

@@ -261,7 +261,8 @@ class McapFile(ChunkedFile):
         (name,) = struct.unpack("<I", view[start : start + 4])
         start += 4 + name
         (data,) = struct.unpack("<Q", view[start : start + 8])
-        return int(data) == length - 40 - name
+        result: bool = int(data) == length - 40 - name
+        return result
 
     def _salvage(self, view: mmap.mmap, position: int) -> list[Recorded]:
         """The first messages of a last chunk that is cut off."""
@@ -304,4 +305,5 @@ def unpack_chunk(content: bytes, *, whole: bool = True) -> bytes:
         raise ValueError(f"{len(chunk.data)} bytes where {chunk.uncompressed_size} should be")
     if whole and chunk.uncompressed_crc and zlib.crc32(chunk.data) != chunk.uncompressed_crc:
         raise ValueError("wrong checksum")
-    return chunk.data
+    result: bytes = chunk.data
+    return result
