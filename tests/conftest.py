@@ -20,16 +20,21 @@ ROOT = Path(__file__).resolve().parents[1]
 # Processes that tests start find the packages, and tests.support, as this process does.
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
 GOLDEN = ROOT / "tests" / "golden"
-# Marker -> the folders and the fixtures whose tests carry it; pyproject.toml says what it means.
-ROS_FOLDERS = ("tests/ros/node", "tests/ros/demo", "tests/ros/online_offline")
+# What a marker means is in pyproject.toml; these are the places and fixtures whose tests carry it.
+ROS_PLACES = (
+    "tests/ros/node",
+    "tests/ros/demo",
+    "tests/ros/replay/test_online_offline.py",
+    "tests/ros/replay/test_same_session.py",
+)
 MARKED_FIXTURES = {"gl": {"renderer"}, "golden": {"shared_dir", "golden_file", "golden_losses"}}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks that follow from where a test is and what it asks for, so that nobody forgets one."""
-    folders = [ROOT / folder for folder in ROS_FOLDERS]
+    places = {ROOT / place for place in ROS_PLACES}
     for item in items:
-        if any(folder in item.path.parents for folder in folders):
+        if places.intersection([item.path, *item.path.parents]):
             item.add_marker("ros")
         for marker, fixtures in MARKED_FIXTURES.items():
             if fixtures.intersection(getattr(item, "fixturenames", ())):

@@ -179,6 +179,7 @@ def rounded(case: str) -> bool:
     return case.startswith("t1_")
 
 
+@pytest.mark.slow
 def test_clip_alignments(golden_losses: Path) -> None:
     for case in cases(golden_losses, r".*/global_align_(first_frame|sequence)/.*"):
         options = arguments(golden_losses)[case]
@@ -315,6 +316,7 @@ def test_motion_vectors(golden_losses: Path) -> None:
         check_gradient(own.grad[0], tensor(golden_losses, f"{case}/out/grad_pred"))
 
 
+@pytest.mark.slow
 def test_whole_training_step(golden_losses: Path) -> None:
     """All terms of the released loss block, its anchors injected, term by term and in total."""
     case = "train_step_b1s9_48x64"

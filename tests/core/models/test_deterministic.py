@@ -55,6 +55,7 @@ def pushed(model: GeometryModel, images: list[np.ndarray], tokens: int | None) -
 
 
 # 24 tokens at 120 x 160: feature maps so small that torch leaves oneDNN for one image.
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "tokens"), [((240, 320), None), ((120, 160), 24)])
 def test_the_bundled_model_on_any_number_of_threads(
     mini: GeometryModel, size: tuple[int, int], tokens: int | None
@@ -67,6 +68,7 @@ def test_the_bundled_model_on_any_number_of_threads(
     assert results[0][0] != results[0][1]
 
 
+@pytest.mark.slow
 def test_moge_on_any_number_of_threads() -> None:
     model, images, results = moge(), frames(2, 100, 140), []
     for threads in THREADS:
@@ -75,6 +77,7 @@ def test_moge_on_any_number_of_threads() -> None:
     assert results[0] == results[1] == results[2]
 
 
+@pytest.mark.slow
 def test_a_camera_in_a_batch_gives_what_it_gives_alone(mini: GeometryModel) -> None:
     torch.set_num_threads(2)
     images = frames(4, 120, 160)

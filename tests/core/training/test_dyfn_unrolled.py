@@ -114,6 +114,7 @@ def test_run_without_a_cache_encodes_clips_of_its_own(place: Path, tmp_path: Pat
     assert not (out / "latents").exists()
 
 
+@pytest.mark.slow
 def test_signal_to_the_whole_process_group_leaves_a_checkpoint(place: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     config = [str(place / "config.yaml"), "--out", str(out)]

@@ -83,6 +83,7 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_run_killed_at_a_random_moment_ends_as_an_uninterrupted_one(
     whole_run: Path, tmp_path: Path
 ) -> None:
@@ -97,6 +98,7 @@ def test_run_killed_at_a_random_moment_ends_as_an_uninterrupted_one(
     assert_same_end(out, whole_run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signal_ends_a_run_with_a_checkpoint(number: signal.Signals, tmp_path: Path) -> None:
     out = tmp_path / "run"

@@ -79,6 +79,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [1, 2])
 def test_two_processes_train_as_one_with_the_whole_batch(
     two: Path, parts: int, tmp_path: Path

@@ -18,6 +18,8 @@ from tests.support.rgbd_frames import rgbd
 from tests.support.ros_graph import DEADLINE, own_domain
 from tests.support.tiny_model import load_tiny
 
+pytestmark = pytest.mark.slow
+
 TINY_NODE = [sys.executable, "-m", "tests.support.tiny_node"]
 
 

@@ -15,6 +15,8 @@ from dyfn_core.models import save_model
 from dyfn_core.models.mini import MiniConfig, MiniModel
 from tests.support.ros_graph import Client, NodeProcess, frames, own_domain
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 TESTS = ("test_encodings.py", "test_compressed_depth.py")
 PARTS = ("dyfn_core", "dyfn_ros", "resource", "launch", "config")

@@ -23,6 +23,8 @@ from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import IMAGE, TYPES
 from tests.support.ros_graph import DEADLINE, own_domain
 
+pytestmark = pytest.mark.slow
+
 COUNT, SIZE = 12, (240, 320)
 CAMERA = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
 
