@@ -134,9 +134,9 @@ def test_one_that_fails_is_reported_and_the_others_finish(
     (walks / "broken.mcap").write_bytes(b"nothing of the kind")
     assert run(tmp_path / "out", walks) == PARTIAL
     assert here == ["a", "b", "broken", "c"]
-    said = capsys.readouterr()
-    assert "broken.mcap: failed (code 2)" in said.err
-    assert "| broken | failed |" in said.out
+    told = capsys.readouterr()
+    assert "broken.mcap: failed (code 2)" in told.err
+    assert "| broken | failed |" in told.out
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [row["code"] for row in summary["recordings"]] == [0, 0, 2, 0]
     assert "broken.mcap" in summary["recordings"][2]["reason"]
@@ -152,7 +152,7 @@ def test_one_that_fails_is_reported_and_the_others_finish(
         rows = list(csv.DictReader(file))
     assert [row["state"] for row in rows] == ["ok", "ok", "failed", "ok"]
     assert float(rows[1]["video_abs_rel"]) == pytest.approx(scores[1])
-    assert (tmp_path / "out" / "summary.md").read_text() in said.out
+    assert (tmp_path / "out" / "summary.md").read_text() in told.out
 
 
 def test_finished_ones_are_not_run_again(walks: Path, tmp_path: Path, here: list[str]) -> None:
@@ -180,7 +180,7 @@ def test_exit_codes_say_all_or_none(walks: Path, tmp_path: Path, here: list[str]
     assert (tmp_path / "none" / "summary.json").exists()
 
 
-def test_a_wrong_model_is_said_once(
+def test_a_wrong_model_is_named_once(
     walks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     common = ["--out", str(tmp_path / "out"), "--model", "huge"]

@@ -1,4 +1,4 @@
-"""The bundled model by the real command lines: what the node says over DDS is what a replay says.
+"""The bundled model by the real command lines: the node's depth over DDS is the replay's.
 
 dyfn-replay and stream_depth run as processes of their own, with their defaults.
 """
@@ -74,7 +74,6 @@ def online(folder: Path) -> Iterator[dict[str, list[bytes]]]:
     kind = frames[0].source.kind
     parameters = {
         "drop_frames": False,  # so that subscriptions are reliable
-        "scene_cut_threshold": 0.0,
         "wait_for_camera_info": True,
         "image_transport": "compressed",
     }
@@ -115,9 +114,9 @@ def test_every_frame_is_answered_with_the_bytes_of_the_replay(
 ) -> None:
     assert len(online["whole"]) == COUNT
     assert online["whole"] == depth_bytes(offline["walk"])
-    said = json.loads((offline["walk"] / "metrics.json").read_text())
-    assert said["stabilizer"] is True and said["model"] == "dyfn-mini"
-    assert hashlib.sha256(b"".join(online["whole"])).hexdigest() == said["output_sha256"]
+    found = json.loads((offline["walk"] / "metrics.json").read_text())
+    assert found["stabilizer"] is True and found["model"] == "dyfn-mini"
+    assert hashlib.sha256(b"".join(online["whole"])).hexdigest() == found["output_sha256"]
 
 
 def test_after_a_reset_in_the_middle_it_is_the_replay_of_the_rest(

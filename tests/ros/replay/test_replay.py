@@ -141,8 +141,8 @@ def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: 
     with (tmp_path / "out" / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
     for name, column in (("scale", "scale"), ("shift", "shift"), ("abs_rel", "image_abs_rel")):
-        said = [message.data for message in read[f"/stream_depth/{name}"]]
-        assert said == pytest.approx([float(row[column]) for row in rows])
+        values = [message.data for message in read[f"/stream_depth/{name}"]]
+        assert values == pytest.approx([float(row[column]) for row in rows])
     depth = read["/stream_depth/depth/image"][2]
     assert (depth.encoding, depth.header.frame_id) == ("32FC1", "camera_optical")
     assert not (depth.data.view(np.float32) == 0).any()
@@ -305,8 +305,8 @@ def test_controls_of_the_latent_are_run_when_asked_for(recording: Path, tmp_path
             stream = DepthStream(model, CAMERA)
             for frame in rgbd(5):
                 truth = np.asarray(frame.depth_m, np.float32)
-                said = as_array(stream.push(frame.image, frame.stamp))
-                scorer.push(said, np.where(truth > 0, truth, np.nan))
+                predicted = as_array(stream.push(frame.image, frame.stamp))
+                scorer.push(predicted, np.where(truth > 0, truth, np.nan))
         image, video = scorer.image(), scorer.video()
         assert image is not None and video is not None
         assert controls[name]["image"] == pytest.approx(image.metrics, rel=1e-6)
@@ -384,8 +384,8 @@ def other_method(
             writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "camera")
             writer.write_depth("/camera/depth", truth, stamp, "camera")
             if index != 1:
-                said = np.where(truth > 0, says(np.where(truth > 0, truth, 1), index), np.nan)
-                writer.write_depth("/other/depth", said, stamp, "camera")
+                predicted = np.where(truth > 0, says(np.where(truth > 0, truth, 1), index), np.nan)
+                writer.write_depth("/other/depth", predicted, stamp, "camera")
     return frames
 
 
@@ -400,9 +400,9 @@ def test_another_methods_topic_is_scored_as_it_stands(tmp_path: Path) -> None:
     scorer = SequenceScorer()
     for index, frame in enumerate(frames):
         truth = np.asarray(frame.depth_m)
-        said = drifting(truth, index)
+        predicted = drifting(truth, index)
         known = (truth > 0) & (index != 1)
-        scorer.push(np.where(known, said, np.nan), np.where(truth > 0, truth, np.nan))
+        scorer.push(np.where(known, predicted, np.nan), np.where(truth > 0, truth, np.nan))
     image, video = scorer.image(), scorer.video()
     assert image is not None and video is not None
     assert found["image"]["abs_rel"] == pytest.approx(image.metrics["abs_rel"], abs=1e-6)

@@ -46,12 +46,14 @@ def facing_a_wall(count: int, poses: bool = True, truth: bool = True) -> list[Fr
 
 
 def perfect_up_to(scale: float, depth: np.ndarray) -> Prediction[np.ndarray]:
-    """What a model would say that is right up to this scale."""
-    said = (depth / scale).astype(np.float32)
+    """What a model would predict that is right up to this scale."""
+    predicted = (depth / scale).astype(np.float32)
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
-    points = np.stack([(u - 23.5) / 40 * said, (v - 17.5) / 40 * said, said], axis=-1)
-    normalised = normalize_intrinsics(CAMERA, said.shape)
-    return Prediction(points, said, np.isfinite(said), normalised, known_camera=CAMERA)
+    points = np.stack(
+        [(u - 23.5) / 40 * predicted, (v - 17.5) / 40 * predicted, predicted], axis=-1
+    )
+    normalised = normalize_intrinsics(CAMERA, predicted.shape)
+    return Prediction(points, predicted, np.isfinite(predicted), normalised, known_camera=CAMERA)
 
 
 @pytest.fixture
@@ -148,7 +150,7 @@ def test_the_video_plays_at_the_pace_of_the_stamps(
 
 
 def test_flicker_is_seen_in_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same scene said 30 % farther is painted in another colour: the range does not follow."""
+    """The same scene, 30 % farther, is painted in another colour: the range does not follow."""
     from dyfn_ros.replay import frame_spool
     from dyfn_ros.replay import video as replay_video
 

@@ -33,7 +33,7 @@ class BenchmarkFrame:
 class Settings:
     """What of every sequence is scored (paper section 5).
 
-    first: frames left out at the start. stride: every so-many-th frame from there on. frames: at
+    first: frames left out at the start. stride: every N-th frame from there on. frames: at
     most so many of these; None is all. depth_max: metres, farther truth is not scored. crop: rows
     cut off above and below, columns cut off left and right, in pixels of the truth.
     """
