@@ -125,8 +125,9 @@ def test_a_frame_from_before_the_load_does_not_touch_the_loaded_state(tmp_path: 
 def test_a_calibration_and_the_last_image_come_back_with_the_state(tmp_path: Path) -> None:
     options = {"metric_source": "reference", "calibration_seconds": 0.1}
     session, path = session_of(**options), str(tmp_path / "s")
+    relative = session_of()  # what a perfect sensor measures, up to scale
     for stamp in (0.0, 0.1, 0.2):
-        points = session_of().push(Frame(picture(0))).points.reshape(-1, 3)
+        points = push(relative, picture(0), stamp).points.reshape(-1, 3)
         points = 3.0 * points[np.isfinite(points).all(1)][::40]
         session.add_reference(stamp, PointReference(points))
         found = push(session, picture(0), stamp)
