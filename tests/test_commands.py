@@ -190,3 +190,11 @@ def test_eval_takes_its_old_names(capsys: pytest.CaptureFixture[str]) -> None:
     assert (str(found.data), found.start, found.max_frames) == ("there", 2, 5)
     assert found.stabilize is False and found.controls is True
     assert capsys.readouterr().err.count("is deprecated, use") == 4
+
+
+def test_train_takes_its_old_names(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "m", "--rendered", "worlds", "--recording", "walk", "--data", "more"]
+    assert dyfn_train.parser().parse_args(words).data == ["worlds", "walk", "more"]
+    words = ["experiments", "--recording", "walk"]
+    assert [path.name for path in dyfn_train.parser().parse_args(words).recording] == ["walk"]
+    assert capsys.readouterr().err.count("is deprecated, use --data") == 3

@@ -46,11 +46,16 @@ def add_data_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(group)
 
 
+def data_spec(text: str) -> DataSpec:
+    """[KIND=]PATH as it is typed."""
+    kind, found, root = text.partition("=")
+    named = bool(found) and not Path(text).exists()
+    return DataSpec(Path(root), kind) if named else DataSpec(Path(text))
+
+
 def open_sequence(options: argparse.Namespace) -> FrameSequence:
     """The chosen sequence. Raises DataError or FileNotFoundError naming what is there."""
-    kind, found, root = options.data.partition("=")
-    named = bool(found) and not Path(options.data).exists()
-    spec = DataSpec(Path(root), kind) if named else DataSpec(Path(options.data))
+    spec = data_spec(options.data)
     split = options.split if resolve(spec) == RENDERED else "train"  # others have one split
     sequences = open_pool([spec], split).sequences
     if options.sequence is None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_core.argument_types import at_least_one
-from dyfn_core.cli.arguments import Commands, add_stride, described
+from dyfn_core.cli.arguments import Commands, add_stride, described, renamed
 from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
 from dyfn_core.evaluation.variants import EncodedSequence, errors_by_length
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
@@ -59,14 +59,16 @@ def add_parser(commands: Commands) -> None:
     )
     add("--seeds", type=at_least_one, default=3, metavar="N", help="runs per arm (default: 3)")
     add("--write", type=Path, metavar="FILE", help="Markdown file to put the tables in")
-    add(
-        "--recording",
+    data = add(
+        "--data",
+        dest="recording",
         type=Path,
         action="append",
         default=[],
         metavar="DIR",
         help="RGB-D folder to score on; may be given several times",
     )
+    renamed(command, "--recording", data)
     add(
         "--clips",
         type=at_least_one,
@@ -180,7 +182,7 @@ def _command(experiment: Experiment, options: argparse.Namespace) -> list[str]:
     """The words to type to get the table again; of an absolute path its name alone."""
     words = ["dyfn-train", "experiments", experiment.name, "--config", _shown(options.config)]
     words += ["--base", _shown(Path(options.base))] if options.base else []
-    words += [word for path in options.recording for word in ("--recording", _shown(path))]
+    words += [word for path in options.recording for word in ("--data", _shown(path))]
     words += ["--seeds", str(options.seeds), "--clips", str(options.clips)]
     words += ["--stride", str(options.stride)]
     if experiment.kind == "lengths" and tuple(options.lengths) != LENGTHS:

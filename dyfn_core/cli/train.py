@@ -15,7 +15,17 @@ import yaml
 
 from dyfn_core.argument_types import at_least_one
 from dyfn_core.cli import experiments
-from dyfn_core.cli.arguments import add_stride, command_parser, described
+from dyfn_core.cli.arguments import (
+    Commands,
+    add_out,
+    add_stride,
+    command_parser,
+    described,
+    renamed,
+)
+from dyfn_core.cli.data_arguments import data_spec
+from dyfn_core.data.datasets import RENDERED
+from dyfn_core.data.pool import resolve
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
 from dyfn_core.evaluation.variants import score_variants, variant_table
@@ -193,19 +203,29 @@ def _curve(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]:
+    if not options.data:
+        raise ValueError("nothing to evaluate on: give --data with a rendered or an RGB-D folder")
     model = load_model(options.model)
     results = {}
-    if options.rendered:
-        shards = list_shards(options.rendered, "clip", "held_out")[: options.clips]
-        if not shards:
-            raise FileNotFoundError(f"no held-out clip under {options.rendered}")
-        clips = [partial(clip_frames, shard, options.stride) for shard in shards]
-        results["held-out clips"] = score_variants(model, clips)
-    for folder in options.recording:
-        frames = partial(folder_frames, folder, options.stride)
-        results[folder.name] = score_variants(model, [frames])
-    if not results:
-        raise ValueError("nothing to evaluate on: give --rendered ROOT and/or --recording FOLDER")
+    for text in options.data:
+        spec = data_spec(text)
+        kind = resolve(spec)
+        if kind == RENDERED:
+            shards = list_shards(spec.root, "clip", "held_out")[: options.clips]
+            if not shards:
+                raise FileNotFoundError(f"no held-out clip under {spec.root}")
+            clips = [partial(clip_frames, shard, options.stride) for shard in shards]
+            name = "held-out clips"
+            results[f"{name} of {spec.root}" if name in results else name] = score_variants(
+                model, clips
+            )
+        elif kind == "rgbd_folder":
+            frames = partial(folder_frames, spec.root, options.stride)
+            results[spec.root.name] = score_variants(model, [frames])
+        else:
+            raise ValueError(
+                f"--data {text}: expected a rendered folder or an RGB-D folder, found {kind}"
+            )
     return results
 
 
@@ -222,50 +242,83 @@ def parser() -> argparse.ArgumentParser:
         SCALE: "former name of `dyfn` with method.kind 'linearized'",
     }
     for name, purpose in purposes.items():
-        command = commands.add_parser(name, help=purpose, description=described(purpose))
-        command.add_argument(
-            "config", type=Path, nargs="?", help="YAML file of settings, or a shipped one's name"
-        )
-        command.add_argument(
-            "--data",
-            action="append",
-            default=[],
-            metavar="[KIND=]PATH",
-            help="recording, RGB-D folder, rendered folder or data set; instead of the config's. "
-            "With options: '{root: PATH, kind: KIND, OPTION: VALUE}'",
-        )
-        command.add_argument("--out", type=Path, required=True, help="folder of the run")
-        command.add_argument("--resume", action="store_true", help="go on from OUT/state.pt")
-        command.add_argument("--max-steps", type=at_least_one, help="stop at this step")
-        command.add_argument(
-            "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
-        )
+        _add_training(commands, name, purpose)
     experiments.add_parser(commands)
+    _add_curve(commands)
+    _add_average(commands)
+    _add_evaluate(commands)
+    return parser
+
+
+def _add_training(commands: Commands, name: str, purpose: str) -> None:
+    command = commands.add_parser(name, help=purpose, description=described(purpose))
+    add = command.add_argument_group("settings").add_argument
+    command.add_argument(
+        "config", type=Path, nargs="?", help="YAML file of settings, or a shipped one's name"
+    )
+    add(
+        "--data",
+        action="append",
+        default=[],
+        metavar="[KIND=]PATH",
+        help="recording, RGB-D folder, rendered folder or data set; instead of the config's. "
+        "With options: '{root: PATH, kind: KIND, OPTION: VALUE}'",
+    )
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting")
+    group = command.add_argument_group("run")
+    add_out(group, "folder of the run")
+    group.add_argument("--resume", action="store_true", help="go on from state.pt in --out")
+    group.add_argument("--max-steps", type=at_least_one, metavar="N", help="stop at step N")
+
+
+def _add_curve(commands: Commands) -> None:
     purpose = "images seen against error of a run: CSV and PNG"
     command = commands.add_parser("curve", help=purpose, description=described(purpose))
-    command.add_argument("run", type=Path, help="folder of a run, with its log.jsonl")
-    command.add_argument("--metric", action="append", default=[], help="default: all logged")
-    command.add_argument("--config", type=Path, help="of the run, if its folder has none")
-    command.add_argument("--out", type=Path, help="folder for both files (default: the run's)")
+    add = command.add_argument
+    add("run", type=Path, help="folder of a run, with its log.jsonl")
+    add(
+        "--metric",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a logged metric; may be given several times (default: all)",
+    )
+    add("--config", type=Path, metavar="FILE", help="the run's config, if its folder has none")
+    add("--out", type=Path, metavar="DIR", help="folder for both files (default: the run's)")
+
+
+def _add_average(commands: Commands) -> None:
     purpose = "mean of the weights of runs with a common start; DyFN is the first's"
     command = commands.add_parser("average", help=purpose, description=described(purpose))
     command.add_argument("models", type=Path, nargs="+", help="checkpoint files")
     command.add_argument(
-        "--shares", type=float, nargs="+", help="of each, divided by their sum (default: equal)"
+        "--shares",
+        type=float,
+        nargs="+",
+        metavar="X",
+        help="weight of each model, divided by their sum (default: equal)",
     )
-    command.add_argument("--out", type=Path, required=True, help="file to write")
+    add_out(command, "file to write").metavar = "FILE"
+
+
+def _add_evaluate(commands: Commands) -> None:
     purpose = "a model and its controls under the image and video protocols"
     command = commands.add_parser("evaluate", help=purpose, description=described(purpose))
-    command.add_argument("model", help="checkpoint or name")
-    command.add_argument("--rendered", type=Path, help="root of rendered folders: held-out clips")
+    command.add_argument("model", help="bundled name, checkpoint file, or Hub id")
+    data = command.add_argument(
+        "--data",
+        action="append",
+        default=[],
+        metavar="[KIND=]PATH",
+        help="rendered folder, whose held-out clips are scored, or RGB-D folder; may be given "
+        "several times",
+    )
+    renamed(command, "--rendered", data)
+    renamed(command, "--recording", data)
     command.add_argument(
         "--clips", type=at_least_one, default=12, metavar="N", help="score N clips (default: 12)"
     )
-    command.add_argument(
-        "--recording", type=Path, action="append", default=[], help="folder with rgb/ and depth/"
-    )
     add_stride(command)
-    return parser
 
 
 if __name__ == "__main__":

@@ -247,7 +247,7 @@ def test_evaluate_prints_the_controls(
     data: Path, base_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = str(base_run / "model.safetensors")
-    assert main(["evaluate", model, "--rendered", str(data), "--stride", "3"]) == 0
+    assert main(["evaluate", model, "--data", str(data), "--stride", "3"]) == 0
     printed = capsys.readouterr().out
     assert all(f"| {name} |" in printed for name in ("ramp", "constant", "base", "ema", "frozen"))
     assert main(["evaluate", model]) == 1
