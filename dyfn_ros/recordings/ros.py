@@ -15,7 +15,7 @@ from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_image
 from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
-from dyfn_ros.recordings.depth_matching import Stamped, match_depth
+from dyfn_ros.recordings.depth_matching import Match, Stamped, match_depth
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.ground_truth import GroundTruth
@@ -45,6 +45,8 @@ class BagRecording:
         self._tolerance_ns = round(tolerance * 1e9)
         self._truth = GroundTruth(transform, self._assumed, quantity)
         self._log_time = stamps == "log"
+        self._matched = 0  # images with a depth
+        self._offsets: list[int] = []  # of the nearest depth beyond the tolerance, ns
 
     @property
     def expected_frames(self) -> int:
@@ -58,15 +60,16 @@ class BagRecording:
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
         calibrator = Rectifier(self._unusable)
         index, last = 0, -1
-        for image, depth in self._pairs():
-            infos.recorded = image.info or infos.recorded
-            if depth is not None:
-                depth_infos.recorded = depth.info or depth_infos.recorded
-            frame = self._decode(index, image, depth, infos, depth_infos, calibrator)
+        for match in self._matches():
+            infos.recorded = match.image.info or infos.recorded
+            if match.depth is not None:
+                depth_infos.recorded = match.depth.info or depth_infos.recorded
+            frame = self._decode(index, match, infos, depth_infos, calibrator)
             if frame is not None:
                 self._check_stamp(frame.stamp_ns, last)
                 index, last = index + 1, frame.stamp_ns
                 yield frame
+        self._note_offset()
         self.notes.losses.update(self._storage.losses)
 
     def _check_stamp(self, stamp_ns: int, last: int) -> None:
@@ -74,10 +77,22 @@ class BagRecording:
             warning = "stamps do not rise (--stamps log takes the time of recording)"
             self.notes.warnings[f"{self.topics.image}: {warning}"] += 1
 
-    def _pairs(self) -> Iterator[tuple[Stamped, Stamped | None]]:
+    def _matches(self) -> Iterator[Match]:
+        self._matched, self._offsets = 0, []
         if self.topics.depth is None:
-            return ((image, None) for image in self._events())
+            return (Match(image) for image in self._events())
         return match_depth(self._events(), self.topics.depth, self._tolerance_ns)
+
+    def _note_offset(self) -> None:
+        """Say how far the nearest depths are away when no image has one."""
+        if self._offsets and self._matched == 0:
+            offset = float(np.median(self._offsets)) * 1e-9
+            side = "after" if offset > 0 else "before"
+            self.notes.warnings[
+                f"{self.topics.depth}: the nearest depth is {abs(offset):.3f} s {side} the image "
+                f"(median), beyond --tolerance {self._tolerance_ns * 1e-9:g}; --stamps log takes "
+                "the time of recording"
+            ] = 1
 
     def _first(self, topic: str | None) -> Recorded | None:
         return next(iter(self._storage.messages([topic] if topic else [])), None)
@@ -116,12 +131,12 @@ class BagRecording:
     def _decode(
         self,
         index: int,
-        image: Stamped,
-        depth: Stamped | None,
+        match: Match,
         infos: _Infos,
         depth_infos: _Infos,
         calibrator: Rectifier,
     ) -> RecordedFrame | None:
+        image = match.image
         message = image.recorded.message()
         frame_id = str(message.header.frame_id)
         compressed = image.recorded.kind == COMPRESSED_IMAGE
@@ -137,24 +152,37 @@ class BagRecording:
             frame_id=frame_id,
             image=view.image,
             camera_matrix=view.matrix,
-            depth=self._decode_depth(depth, depth_infos.message(), view, frame_id),
+            depth=self._decode_depth(match, depth_infos.message(), view, frame_id),
             source=image.recorded,
             info=infos.recorded,
             visible=view.visible,
         )
 
     def _decode_depth(
-        self, depth: Stamped | None, info: Any, view: PinholeImage, frame_id: str
+        self, match: Match, info: Any, view: PinholeImage, frame_id: str
     ) -> np.ndarray | None:
-        if depth is None:
-            if self.topics.depth is not None:
-                self.notes.warnings[f"{self.topics.depth}: no depth at an image's stamp"] += 1
+        if match.depth is None:
+            self._note_unmatched(match)
             return None
+        self._matched += 1
         try:
-            return self._truth.decode(depth.recorded, info, view, frame_id)
+            return self._truth.decode(match.depth.recorded, info, view, frame_id)
         except MessageError as error:
-            self.notes.losses[f"{depth.recorded.topic}: depth skipped: {error}"] += 1
+            self.notes.losses[f"{match.depth.recorded.topic}: depth skipped: {error}"] += 1
             return None
+
+    def _note_unmatched(self, match: Match) -> None:
+        if self.topics.depth is None:
+            return
+        reason = "no depth at an image's stamp"
+        if match.ambiguous:
+            reason += (
+                " is used where several images or depths have that stamp: nothing tells which "
+                "belong together (--stamps log takes the time of recording)"
+            )
+        elif match.nearest_ns is not None:
+            self._offsets.append(match.nearest_ns)
+        self.notes.warnings[f"{self.topics.depth}: {reason}"] += 1
 
 
 class _Infos:
