@@ -17,6 +17,8 @@ from dyfn_ros.demo import cli as dyfn_demo
 from dyfn_ros.record import cli as dyfn_record
 from dyfn_ros.replay import cli as dyfn_replay
 from dyfn_ros.replay import options as replay_options
+from dyfn_ros.replay.options import parse
+from dyfn_ros.replay.settings import Run, SessionOptions
 from dyfn_worlds import cli as dyfn_worlds
 
 WRITER = Path(__file__).parents[1] / "docs/write_cli.py"
@@ -198,3 +200,9 @@ def test_train_takes_its_old_names(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["experiments", "--recording", "walk"]
     assert [path.name for path in dyfn_train.parser().parse_args(words).recording] == ["walk"]
     assert capsys.readouterr().err.count("is deprecated, use --data") == 3
+
+
+def test_zero_tokens_are_the_models_own_as_in_the_node() -> None:
+    command = parse(["walk", "--out", "out", "--num-tokens", "0"])
+    assert isinstance(command.job.run, Run)
+    assert command.job.run.stream.num_tokens == SessionOptions().num_tokens == 0

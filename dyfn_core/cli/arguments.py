@@ -122,10 +122,14 @@ def add_num_tokens(options: Options) -> None:
     """--num-tokens."""
     options.add_argument(
         "--num-tokens",
-        type=at_least_one,
+        type=_tokens,
         metavar="N",
-        help="resolution inside the model: tokens per image (default: the model's own)",
+        help="resolution inside the model: tokens per image; 0: the model's own (default: 0)",
     )
+
+
+def _tokens(text: str) -> int | None:
+    return not_negative(text) or None
 
 
 def add_stabilize(options: Options) -> None:

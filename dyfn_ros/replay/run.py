@@ -135,8 +135,9 @@ def _alignment(evaluation: SequenceEvaluation) -> Alignment | None:
     """What brings all frames into metres: the truth's alignment, else their own scale."""
     video = evaluation.video()
     if video is not None:
-        return Alignment(video.scale, video.shift, evaluation.quantity)
-    return Alignment() if evaluation.metric_frames == evaluation.frames else None
+        return Alignment(video.scale, video.shift, evaluation.quantity, metres=True)
+    in_metres = evaluation.metric_frames == evaluation.frames
+    return Alignment(metres=True) if in_metres else None
 
 
 def _variant(

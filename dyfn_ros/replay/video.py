@@ -24,11 +24,18 @@ USUAL_STEP, LONGEST_STEP = 0.1, 1.0  # seconds a frame is shown when stamps go b
 
 @dataclass(frozen=True)
 class Alignment:
-    """scale, shift: of the video protocol; 1 and 0 without truth. quantity: what is aligned."""
+    """How predictions become one depth for the whole recording.
+
+    Attributes:
+        scale, shift: Of the video protocol; 1 and 0 without truth.
+        quantity: What is aligned.
+        metres: Whether the aligned depth is in metres; else it is right up to scale.
+    """
 
     scale: float = 1.0
     shift: float = 0.0
     quantity: str = "depth"
+    metres: bool = False
 
     def depth(self, predicted: np.ndarray) -> np.ndarray:
         """H x W depth or disparity, as predicted -> aligned depth."""
@@ -106,7 +113,7 @@ class _Colours:
         """Rows and columns x 3 uint8 RGB, both even as yuv420p asks for."""
         depth = self._alignment.depth(frame.predicted)
         panels = {"input": frame.image}
-        unit = "m" if self._error else "(up to scale)"
+        unit = "m" if self._alignment.metres else "(up to scale)"
         panels[f"depth {self._near:.2g} to {self._far:.2g} {unit}"] = colour_depth(
             depth, self._near, self._far
         )
