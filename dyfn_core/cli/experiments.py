@@ -160,7 +160,7 @@ def _curve(
     stabilizer: DyFN | None,
     lengths: Sequence[int],
 ) -> dict[int, float]:
-    """Number of frames -> mean over the sequences that have so many."""
+    """Number of frames -> mean over the sequences that long."""
     curves = [errors_by_length(model, s, stabilizer, lengths) for s in sequences]
     reached = sorted({length for curve in curves for length in curve})
     return {n: float(np.mean([c[n] for c in curves if n in c])) for n in reached}

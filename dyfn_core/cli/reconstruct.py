@@ -145,8 +145,8 @@ def _write(
     sequence: str,
 ) -> None:
     out: Path = options.out
-    said = {key: value for key, value in vars(options).items() if key not in ("run", "command")}
-    shown = {key: str(v) if isinstance(v, Path) else v for key, v in said.items()}
+    given = {key: value for key, value in vars(options).items() if key not in ("run", "command")}
+    shown = {key: str(v) if isinstance(v, Path) else v for key, v in given.items()}
     runs = {name: result.values() for name, result in results.items()}
     summary = {
         "sequence": sequence,

@@ -65,7 +65,7 @@ class DyFNConfig:
 
 
 def build_dyfn(channels: int, config: DyFNConfig) -> DyFN:
-    """A fresh, untrained DyFN for a latent of so many channels."""
+    """A fresh, untrained DyFN for a latent with that number of channels."""
     if config.kind == "gru":
         return GRUDyFN(channels, config)
     return ConvGRUDyFN(channels, config)

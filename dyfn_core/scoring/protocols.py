@@ -74,7 +74,7 @@ class SequenceScorer:
         self.frames = FrameScores()
         self._kept = Samples()
         self._step = 1
-        self._video: tuple[int, SequenceScore | None] = (0, None)  # of so many frames
+        self._video: tuple[int, SequenceScore | None] = (0, None)  # frames, and their score
 
     def push(
         self, prediction: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None

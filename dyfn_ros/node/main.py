@@ -37,7 +37,7 @@ def _make(args: Sequence[str] | None, load: ModelLoader | None) -> StreamDepthNo
 
 
 def _autostart(node: StreamDepthNode) -> bool:
-    """Configure and activate. -> whether that worked; the node has said why if not."""
+    """Configure and activate. -> whether that worked; the node logs why not."""
     success = TransitionCallbackReturn.SUCCESS
     try:
         configured = node.trigger_configure() == success

@@ -50,14 +50,14 @@ class SequencePictures:
         self,
         index: int,
         image: np.ndarray,
-        said: np.ndarray,
+        predicted: np.ndarray,
         truth: np.ndarray,
         score: FrameScore,
     ) -> None:
-        """One frame; image: H x W x 3 uint8 RGB, said and truth: h x w, NaN where there is none."""
+        """One frame; image: H x W x 3 uint8 RGB; predicted, truth: h x w, NaN where unknown."""
         if self.strip is not None:
-            self.strip.add(index, image, said, truth)
-        self.worst.add(index, image, said, truth, score)
+            self.strip.add(index, image, predicted, truth)
+        self.worst.add(index, image, predicted, truth, score)
 
 
 class BenchmarkPictures:

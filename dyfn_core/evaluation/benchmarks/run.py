@@ -110,8 +110,8 @@ def _push_all(
         if temporal is not None:
             temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
         if taken is not None:
-            said = maps[scorers.variants[0]]
-            taken.add(count - 1, frame.image, said, truth, scorers.first.frames[-1])
+            predicted = maps[scorers.variants[0]]
+            taken.add(count - 1, frame.image, predicted, truth, scorers.first.frames[-1])
     return count
 
 

@@ -40,7 +40,7 @@ class Matcher(Protocol):
 class FlowMatcher:
     """DIS optical flow both ways; kept where going there and back ends within a pixel.
 
-    samples: about so many starts, on a regular grid.
+    samples: number of starts, about, on a regular grid.
     """
 
     samples: int = 1500

@@ -11,7 +11,7 @@ from dyfn_core.evaluation.report.pictures import FrameStrip, Snapshot, snapshot
 from dyfn_core.prediction import DEPTH, DISPARITY
 from dyfn_core.scoring.frame_scores import FrameScore
 
-STRETCHES = 24  # a recording is cut into so many; of each at most one frame is called worst
+STRETCHES = 24  # parts of a recording; at most one frame of each is among the worst
 KEPT = 10  # stretches a reason
 WIDTH = 200
 
@@ -57,12 +57,12 @@ class WorstFrames:
                     del kept[min(kept, key=lambda place: kept[place].badness)]
 
     def _log_ratio(self, depth: np.ndarray, truth: np.ndarray) -> float:
-        said = depth[np.isfinite(depth) & (depth > 0)]
+        predicted = depth[np.isfinite(depth) & (depth > 0)]
         true = truth[np.isfinite(truth) & (truth > 0)]
-        if not said.size or not true.size:
+        if not predicted.size or not true.size:
             return 0.0
         sign = -1 if self.quantity == DISPARITY else 1
-        return float(np.log(np.median(true)) - sign * np.log(np.median(said)))
+        return float(np.log(np.median(true)) - sign * np.log(np.median(predicted)))
 
     def _enters(self, kept: dict[int, _Candidate], index: int, badness: float) -> bool:
         same = kept.get(index // self.stretch)

@@ -32,7 +32,7 @@ class Task(ABC):
     def batches(self, start: int, part: int = 0, parts: int = 1) -> Iterator[Any]:
         """One part of the batches from step `start` on; a dataclass of tensors each.
 
-        Raises ConfigError when the batch cannot be split into so many equal parts.
+        Raises ConfigError when the batch cannot be split into that number of equal parts.
         """
 
     @abstractmethod
