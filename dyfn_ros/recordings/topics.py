@@ -17,6 +17,15 @@ NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}
 TRIES = 16  # messages of a topic, to see what it holds
 TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
+# Names in lower case. A device that is called after its depth says nothing about its topics.
+_DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$)")
+_OF_DEPTH = re.compile(r"depth|disparity")
+_COLOUR_SPACE = re.compile(
+    r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/"
+)  # a namespace, no picture's own name
+_OTHER_LIGHT = re.compile(
+    r"infra|thermal|lwir|lepton|amplitude|intensity|confidence|(?:^|[/_])ir_?\d*(?:[/_]|$)"
+)
 
 
 @dataclass(frozen=True)
@@ -24,12 +33,14 @@ class Topics:
     """image: colour, raw or compressed. camera_info, depth, depth_info: None to do without.
 
     depth: images or clouds; depth_info: the CameraInfo of depth images that have their own.
+    remarks: what is recorded and not used although it might be expected to be.
     """
 
     image: str
     camera_info: str | None
     depth: str | None
     depth_info: str | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def choose_topics(
@@ -43,17 +54,20 @@ def choose_topics(
     """Take the named topics, and find the others by type when there is one candidate.
 
     An image counts as depth when its encoding is 16UC1 or 32FC1 (mono16 when its name says
-    depth). A topic recorded both raw and compressed is one candidate: the raw one. Of several
-    CameraInfos, the sibling of the image topic is taken; of several depths, the one in the
-    image's namespace. A PointCloud2 is depth when it is named. Raises RecordingError: a named
-    topic that is absent or of another type, no image topic, several candidates.
+    depth) and its name does not say infrared, thermal or the like. A topic recorded both raw and
+    compressed is one candidate: the one with more messages, of equals the raw one. Infrared
+    images count when there are no others. Of several CameraInfos, the sibling of the image topic
+    is taken; of several depths, the one in the image's namespace. A PointCloud2 is depth when it
+    is named. Raises RecordingError: a named topic that is absent or of another type, no image
+    topic, several candidates.
     """
     kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
     colours, depths = _classify(storage, kinds)
     images = {IMAGE, COMPRESSED_IMAGE}
-    chosen = _named(path, kinds, image, images) or _only(path, kinds, colours, "image")
+    visible = [name for name in colours if not _OTHER_LIGHT.search(name.lower())] or colours
+    chosen = _named(path, kinds, image, images) or _only(path, kinds, visible, "image")
     if chosen is None:
-        raise RecordingError(f"{path}: no colour image topic; it holds {_listing(kinds, kinds)}")
+        raise _no_image(path, storage, kinds)
     truth = _optional(
         path,
         kinds,
@@ -69,7 +83,43 @@ def choose_topics(
         camera_info=info,
         depth=truth,
         depth_info=_optional(path, kinds, depth_info, {CAMERA_INFO}, own),
+        remarks=(*_fuller_twins(storage, [chosen, truth]), *_empty(storage)),
     )
+
+
+def _no_image(path: Path, storage: Storage, kinds: dict[str, str]) -> RecordingError:
+    text = f"no colour image topic; it holds {_listing(kinds, kinds)}"
+    pictures = [name for name, kind in kinds.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+    if pictures:
+        text += "; --image-topic takes one that is taken for depth or a picture of depth"
+    return RecordingError("; ".join([f"{path}: {text}", *_empty(storage)]))
+
+
+def _empty(storage: Storage) -> list[str]:
+    """Of the topics that might have been used, those without messages."""
+    names = {
+        name: topic.kind
+        for name, topic in storage.topics.items()
+        if not topic.count and topic.kind in (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+    }
+    if not names:
+        return []
+    return [
+        f"recorded without messages: {_listing(names, names)} (did the recorder's quality of "
+        "service match the publisher's?)"
+    ]
+
+
+def _fuller_twins(storage: Storage, used: list[str | None]) -> list[str]:
+    """Of each used topic, the transports that hold more messages."""
+    found = []
+    for name in filter(None, used):
+        count = storage.topics[name].count
+        for twin, topic in storage.topics.items():
+            same = TRANSPORTS.sub("", twin) == TRANSPORTS.sub("", name)
+            if same and topic.kind in (IMAGE, COMPRESSED_IMAGE) and topic.count > count:
+                found.append(f"{name} holds {count} messages, {twin} {topic.count}")
+    return found
 
 
 def choose_reference(path: Path, storage: Storage, name: str | None, kind: str) -> str:
@@ -112,7 +162,7 @@ def image_topics(path: Path, storage: Storage) -> list[str]:
     kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
     colours, _ = _classify(storage, kinds)
     if not colours:
-        raise RecordingError(f"{path}: no colour image topic; it holds {_listing(kinds, kinds)}")
+        raise _no_image(path, storage, kinds)
     return colours
 
 
@@ -165,16 +215,29 @@ def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[
         message = _first(storage, name)
         if message is None:
             continue
-        if kind == IMAGE:
-            named = message.encoding == "mono16" and "depth" in name
-            is_depth = message.encoding in DEPTH_ENCODINGS or named
-        else:
-            is_depth = is_compressed_depth(message)
-        if is_depth:
-            depths.append(name)
-        elif "depth" not in name and "disparity" not in name:
-            colours.append(name)  # a coloured picture of depth is neither
-    return _raw_first(colours), _raw_first(depths)
+        if _is_depth(name, kind, message):
+            if not _OTHER_LIGHT.search(name.lower()):
+                depths.append(name)
+        elif not _pictures_depth(name):
+            colours.append(name)
+    return _one_of_twins(storage, colours), _one_of_twins(storage, depths)
+
+
+def _is_depth(name: str, kind: str, message: Any) -> bool:
+    if kind == COMPRESSED_IMAGE:
+        return is_compressed_depth(message)
+    named = message.encoding == "mono16" and "depth" in name.lower()
+    return message.encoding in DEPTH_ENCODINGS or named
+
+
+def _pictures_depth(name: str) -> bool:
+    """Whether an image is, by its name, a coloured picture of depth.
+
+    The innermost namespace that says colour or depth decides.
+    """
+    words = _DEVICE.sub("", TRANSPORTS.sub("", name).lower())
+    inner = _COLOUR_SPACE.split(words)[-1]
+    return bool(_OF_DEPTH.search(inner))
 
 
 def _first(storage: Storage, name: str) -> Any:
@@ -194,10 +257,11 @@ def _nearest(depths: list[str], image: str) -> list[str]:
     return near if len(near) == 1 else depths
 
 
-def _raw_first(names: list[str]) -> list[str]:
-    """Drop the compressed twins of raw topics, and compressedDepth beside compressed."""
+def _one_of_twins(storage: Storage, names: list[str]) -> list[str]:
+    """Of a topic in several transports the one with the most messages, of equals the raw one."""
     kept: dict[str, str] = {}
-    for name in sorted(names, key=lambda n: (len(TRANSPORTS.findall(n)), n)):
+    order = sorted(names, key=lambda n: (-storage.topics[n].count, len(TRANSPORTS.findall(n)), n))
+    for name in order:
         kept.setdefault(TRANSPORTS.sub("", name), name)
     return sorted(kept.values())
 
@@ -209,6 +273,9 @@ def _infos(kinds: dict[str, str], image: str) -> list[str]:
 
 
 def _siblings(kinds: dict[str, str], image: str) -> list[str]:
-    """The CameraInfo beside an image topic."""
-    sibling = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/camera_info"
-    return [sibling] if kinds.get(sibling) == CAMERA_INFO else []
+    """The CameraInfo beside an image topic, or where the RealSense SDK puts it."""
+    base = TRANSPORTS.sub("", image)
+    beside = base.rsplit("/", 1)[0] + "/camera_info"
+    of_sdk = base.removesuffix("/image/data") + "/info/camera_info"
+    found = [name for name in (beside, of_sdk) if kinds.get(name) == CAMERA_INFO]
+    return found[:1]

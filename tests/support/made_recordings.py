@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -14,7 +15,7 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from dyfn_ros.recordings.typestore import IMAGE, TYPES, image_message
+from dyfn_ros.recordings.typestore import CAMERA_INFO, IMAGE, TYPES, image_message
 
 SIZE = (24, 32)
 STEP_NS = 100_000_000
@@ -79,6 +80,18 @@ def write_mcap(
         writer.finish()
 
 
+def ros1_bytes(message: Any, kind: str) -> bytes:
+    """An Image or a CameraInfo of ROS 2 as ROS 1 serialises it."""
+    fields = {n: getattr(message, n) for n in message.__dataclass_fields__ if n != "__msgtype__"}
+    stamp = ROS1.types["builtin_interfaces/msg/Time"](
+        message.header.stamp.sec, message.header.stamp.nanosec
+    )
+    fields["header"] = ROS1.types["std_msgs/msg/Header"](0, stamp, message.header.frame_id)
+    if kind == CAMERA_INFO:
+        fields = {n.upper() if len(n) == 1 else n: value for n, value in fields.items()}
+    return bytes(ROS1.serialize_ros1(ROS1.types[kind](**fields), kind))
+
+
 def write_bag1(
     path: Path, indices: range, compression: Bag1Writer.CompressionFormat | None = None
 ) -> None:
@@ -88,14 +101,9 @@ def write_bag1(
     writer.chunk_threshold = 2 * len(image_bytes(0))
     with writer:
         connection = writer.add_connection(TOPIC, IMAGE, typestore=ROS1)
-        header, time = ROS1.types["std_msgs/msg/Header"], ROS1.types["builtin_interfaces/msg/Time"]
         for index in indices:
-            seconds, rest = divmod(stamp_ns(index), 1_000_000_000)
-            made = image_message(shade(index), "rgb8", 0, "")
-            fields = {name: getattr(made, name) for name in made.__dataclass_fields__}
-            fields["header"] = header(index, time(seconds, rest), "camera")
-            message = ROS1.types[IMAGE](**{k: v for k, v in fields.items() if k != "__msgtype__"})
-            writer.write(connection, stamp_ns(index), ROS1.serialize_ros1(message, IMAGE))
+            message = image_message(shade(index), "rgb8", stamp_ns(index), "camera")
+            writer.write(connection, stamp_ns(index), ros1_bytes(message, IMAGE))
 
 
 def write_split(path: Path, indices: range) -> None:
