@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import Lens, random_view
+from dyfn_worlds.camera.cameras import CameraLens, random_view
 from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.camera.staging import stand
 from dyfn_worlds.generate import RoomWorlds
@@ -42,7 +42,7 @@ def main() -> None:
         photographer = Photographer(renderer, worlds.scene(rng, False), rng)
         scene, space = photographer.scene, photographer.space
         for _ in range(VIEWS):
-            lens = Lens.sample(rng, renderer.size)
+            lens = CameraLens.sample(rng, renderer.size)
             camera = random_view(space, rng, lens, scene.interests)
             moment = Moment(stand(space, rng, scene.actors, camera, 3))
             renderer.draw(camera)

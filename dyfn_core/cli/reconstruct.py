@@ -29,7 +29,7 @@ from dyfn_core.evaluation.reconstruction.runs import (
 )
 from dyfn_core.evaluation.report.html import (
     Part,
-    Picture,
+    ReportPicture,
     Section,
     Table,
     Text,
@@ -163,7 +163,7 @@ def _write(
         (out / f"cloud_{stem}.png").write_bytes(encode_picture(picture))
         if len(points):
             write_ply(out / f"cloud_{stem}.ply", points, colours)
-        parts: list[Part] = [Picture(picture, f"cloud, {name}: from above and obliquely")]
+        parts: list[Part] = [ReportPicture(picture, f"cloud, {name}: from above and obliquely")]
         parts += [Text(text, note=True) for text in _told(results[name])]
         pictures.append(Section(f"Fused cloud, {name}", parts))
     _write_frames(out / "frames.csv", found)

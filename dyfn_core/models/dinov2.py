@@ -80,7 +80,7 @@ class LayerScale(nn.Module):
         return x * self.gamma
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm transformer block with layer scale."""
 
     def __init__(self, channels: int, heads: int) -> None:
@@ -113,7 +113,7 @@ class DinoV2(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + TRAINED_GRID**2, self.channels))
         # In every released file; masks patches in pre-training, unused here.
         self.mask_token = nn.Parameter(torch.zeros(1, self.channels))
-        self.blocks = nn.ModuleList(Block(self.channels, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(TransformerBlock(self.channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(self.channels, eps=1e-6)
 
     def forward(self, image: Tensor, layers: int | Sequence[int]) -> list[Tensor]:

@@ -90,7 +90,7 @@ class NormalisedConv(nn.Module):
             self.scale = None
 
 
-class Block(nn.Module):
+class InvertedResidual(nn.Module):
     """Inverted residual: expand 1x1, depthwise, project 1x1; ReLU6 in between."""
 
     def __init__(
@@ -118,14 +118,16 @@ class EfficientNetLite0(nn.Module):
     def __init__(self, folded: bool = True) -> None:
         super().__init__()
         self.stem = NormalisedConv(3, STEM_CHANNELS, 3, stride=2, folded=folded)
-        blocks: list[Block] = []
+        blocks: list[InvertedResidual] = []
         self.last_block: list[int] = []
         channels = STEM_CHANNELS
         for stage in STAGES:
             for repeat in range(stage.repeats):
                 stride = stage.stride if repeat == 0 else 1
                 blocks.append(
-                    Block(channels, stage.channels, stage.kernel, stride, stage.expansion, folded)
+                    InvertedResidual(
+                        channels, stage.channels, stage.kernel, stride, stage.expansion, folded
+                    )
                 )
                 channels = stage.channels
             if stage.channels in FEATURE_CHANNELS:
@@ -162,7 +164,7 @@ class EfficientNetLite0(nn.Module):
         wanted = {"stem": ("_conv_stem", "_bn0")}
         for index, block in enumerate(self.blocks):
             own, theirs = f"blocks.{index}", f"_blocks.{index}"
-            if isinstance(block, Block) and block.expand is not None:
+            if isinstance(block, InvertedResidual) and block.expand is not None:
                 wanted[f"{own}.expand"] = (f"{theirs}._expand_conv", f"{theirs}._bn0")
             wanted[f"{own}.depthwise"] = (f"{theirs}._depthwise_conv", f"{theirs}._bn1")
             wanted[f"{own}.project"] = (f"{theirs}._project_conv", f"{theirs}._bn2")

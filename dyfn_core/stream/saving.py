@@ -57,7 +57,7 @@ class StreamSettings:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class StreamSnapshot:
     """All of one moment between two frames; made of values that are never changed."""
 
     settings: StreamSettings
@@ -85,7 +85,7 @@ class StateKeeper:
     def __init__(self, stages: Sequence[StreamStage], model: GeometryModel) -> None:
         self._stages = [stage for stage in stages if stage.saved_as]
         self._model = model
-        self._now: Snapshot | None = None
+        self._now: StreamSnapshot | None = None
 
     @cached_property
     def fingerprint(self) -> str:
@@ -95,7 +95,7 @@ class StateKeeper:
     def remember(self, settings: StreamSettings, stream: DepthStream) -> None:
         """The session stands here, between two frames."""
         states = {stage.saved_as: stage.state for stage in self._stages}
-        self._now = Snapshot(settings, stream.camera_matrix, stream.memory, states)
+        self._now = StreamSnapshot(settings, stream.camera_matrix, stream.memory, states)
 
     def save(self, path: str) -> str:
         """-> what was saved. Raises StateError; an older file is then still there."""

@@ -97,14 +97,14 @@ def default_recording() -> Path:
 
 
 @dataclass(frozen=True)
-class Run:
+class DemoRun:
     """One pass through the node. clouds: pictures of some of the received clouds, side by side."""
 
     evaluation: SequenceEvaluation
     clouds: np.ndarray
 
 
-def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[str, Run]:
+def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[str, DemoRun]:
     """Play the recording once per run through one live node and write the report.
 
     Raises RecordingError (the recording), LiveError (the node), ImportError (no ROS).
@@ -142,7 +142,7 @@ def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[st
 
 def _run(
     name: str, stabilize: bool, player: LivePlayer, recording: Recording, limit: int | None
-) -> Run:
+) -> DemoRun:
     player.reset(stabilize)
     expected = min(recording.expected_frames, limit or recording.expected_frames)
     evaluation = SequenceEvaluation(expected)
@@ -162,7 +162,7 @@ def _run(
             stamp=result.frame.stamp_ns / 1e9,
             latency=result.latency,
         )
-    return Run(evaluation, np.hstack(clouds) if clouds else np.zeros((1, 1, 3), np.uint8))
+    return DemoRun(evaluation, np.hstack(clouds) if clouds else np.zeros((1, 1, 3), np.uint8))
 
 
 def cloud_arrays(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +178,7 @@ def _check_cloud(frame: RecordedFrame, depth: np.ndarray, cloud: np.ndarray) -> 
         raise LiveError(f"frame {frame.index}: the cloud's z is not the depth image")
 
 
-def _write(options: DemoOptions, recording: Recording, runs: dict[str, Run]) -> None:
+def _write(options: DemoOptions, recording: Recording, runs: dict[str, DemoRun]) -> None:
     evaluations = {name: run.evaluation for name, run in runs.items()}
     results = {name: evaluation.results() for name, evaluation in evaluations.items()}
     out = options.out

@@ -20,8 +20,8 @@ from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.images import MessageError, decode_image
 from dyfn_ros.messages.rectify import Rectifier, RectifyRules
 from dyfn_ros.node.metric_scale import ScaleTopics
-from dyfn_ros.node.outputs import Outputs
-from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.outputs import NodeOutputs
+from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.statistics import FrameStatistics
 from dyfn_ros.node.topics import NodeTopics
 
@@ -61,7 +61,7 @@ class Camera:
         node: LifecycleNode,
         ports: NodeTopics,
         name: str,
-        settings: Callable[[], Settings],
+        settings: Callable[[], NodeSettings],
         submit: Callable[[FrameJob], bool],
         release: Callable[[], None],
         warn: Say,
@@ -72,7 +72,7 @@ class Camera:
         self.statistics = FrameStatistics()
         self.active = False
         self.session: StreamSession | None = None  # once there is a model
-        self.outputs = Outputs(ports, self.prefix, not settings().drop_frames)
+        self.outputs = NodeOutputs(ports, self.prefix, not settings().drop_frames)
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
         self._info: CameraInfo | None = None
@@ -86,7 +86,7 @@ class Camera:
         return f"{self.name}/" if self.name else ""
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> NodeSettings:
         """The values in force."""
         return self._settings()
 

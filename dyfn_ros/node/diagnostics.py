@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from dyfn_ros.node.camera import Camera
-from dyfn_ros.node.parameters.table import Settings
-from dyfn_ros.node.statistics import Snapshot
+from dyfn_ros.node.parameters.table import NodeSettings
+from dyfn_ros.node.statistics import StatisticsSnapshot
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -23,7 +23,7 @@ class Report:
 
     name: str
     phase: str
-    settings: Settings
+    settings: NodeSettings
     device: str
     error: BaseException | None
     mismatches: Mapping[str, str]
@@ -100,7 +100,9 @@ def _milliseconds(name: str, seconds: tuple[float, float] | None) -> dict[str, s
     }
 
 
-def _camera_problems(report: Report, camera: Camera, snapshot: Snapshot) -> list[tuple[bytes, str]]:
+def _camera_problems(
+    report: Report, camera: Camera, snapshot: StatisticsSnapshot
+) -> list[tuple[bytes, str]]:
     problems = []
     if failed := snapshot.recent.get("failed"):
         problems.append((ERROR, f"inference failed on {failed} frames"))

@@ -14,7 +14,7 @@ from std_msgs.msg import Float64
 from dyfn_core.metric.scale import ScaleInForce
 from dyfn_core.stream.session import StreamSession
 from dyfn_ros.messages.references import message_references
-from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 
 _REFERENCE_DEPTH = 20
@@ -31,7 +31,7 @@ class ScaleTopics:
         ports: NodeTopics,
         prefix: str,
         title: str,
-        settings: Settings,
+        settings: NodeSettings,
     ) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._title = title
@@ -49,7 +49,9 @@ class ScaleTopics:
             )
             self.topic = subscription.topic_name
 
-    def open(self, session: StreamSession, settings: Settings, warn: Callable[[str], None]) -> None:
+    def open(
+        self, session: StreamSession, settings: NodeSettings, warn: Callable[[str], None]
+    ) -> None:
         """Give the session what comes from now on.
 
         warn: takes the reason why a measurement cannot be read. Raises ValueError when the

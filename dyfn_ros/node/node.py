@@ -23,7 +23,7 @@ from dyfn_ros.node.diagnostics import Report, node_diagnostics
 from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.parameters.declare import NodeParameters
-from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 from dyfn_ros.node.worker import FrameWorker
 
@@ -63,7 +63,7 @@ class StreamDepthNode(LifecycleNode):
         )
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> NodeSettings:
         """The values in force."""
         return self._table.settings
 

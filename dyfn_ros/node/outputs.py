@@ -16,7 +16,7 @@ from dyfn_ros.messages.camera_info import camera_info_message
 from dyfn_ros.messages.clouds import cloud_message, pack_cloud
 from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
 from dyfn_ros.messages.images import colour_message, compressed_message, depth_message
-from dyfn_ros.node.parameters.table import Settings
+from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 
 _OUTPUT_DEPTH = 5
@@ -24,7 +24,7 @@ _LOSSLESS_DEPTH = 100  # a cloud of 640 x 480 is 10 MB
 _RESETS_DEPTH = 10
 
 
-class Outputs:
+class NodeOutputs:
     """The topics `~/depth/...`, `~/points` and `~/resets` of one camera.
 
     prefix: "" or "CAMERA/", before each of these names. The inference thread publishes.
@@ -56,7 +56,7 @@ class Outputs:
         image: np.ndarray,
         prediction: Prediction[np.ndarray],
         info: CameraInfo | None,
-        settings: Settings,
+        settings: NodeSettings,
     ) -> None:
         """header: of the input, kept as it is. info: describes the image; None when unknown."""
         depth, encoding = prediction.depth, settings.depth_encoding
@@ -113,7 +113,7 @@ class ColourScale:
 
 
 def filtered_cloud(
-    prediction: Prediction[np.ndarray], valid: np.ndarray, image: np.ndarray, settings: Settings
+    prediction: Prediction[np.ndarray], valid: np.ndarray, image: np.ndarray, settings: NodeSettings
 ) -> np.ndarray:
     """The cloud that the points_... settings ask for: h x w of CLOUD_DTYPE.
 

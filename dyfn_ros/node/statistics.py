@@ -15,7 +15,7 @@ PLAUSIBLE = 3600.0  # seconds; a latency beyond says that stamps are of another 
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class StatisticsSnapshot:
     """The numbers of one moment.
 
     counts: since the start: received, published, bad (not usable), failed (inference raised),
@@ -49,7 +49,7 @@ class FrameStatistics:
         self._at = clock()
 
     def count(self, what: str) -> None:
-        """One more of these; see Snapshot.counts."""
+        """One more of these; see StatisticsSnapshot.counts."""
         with self._lock:
             self._counts[what] += 1
 
@@ -66,7 +66,7 @@ class FrameStatistics:
         with self._lock:
             return Counter(self._counts)
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> StatisticsSnapshot:
         """The numbers now; rates are of the time since the last call."""
         with self._lock:
             now, counts = self._clock(), Counter(self._counts)
@@ -75,7 +75,7 @@ class FrameStatistics:
             latency, processing = list(self._latency), list(self._processing)
             self._at, self._before = now, counts
         quantiles = _quantiles(latency)
-        return Snapshot(
+        return StatisticsSnapshot(
             counts=dict(counts),
             recent=dict(recent),
             input_rate=recent["received"] / seconds,

@@ -96,27 +96,27 @@ def pose_at(position: np.ndarray, yaw: float, pitch: float, roll: float) -> np.n
 
 
 @dataclass(frozen=True)
-class Lens:
+class CameraLens:
     """Normalised focal lengths of a camera with square pixels."""
 
     focal: tuple[float, float]
 
     @staticmethod
-    def of_view(degrees: float, size: tuple[int, int]) -> Lens:
+    def of_view(degrees: float, size: tuple[int, int]) -> CameraLens:
         """The lens with a horizontal field of view, for images of size (height, width)."""
         fx = 0.5 / np.tan(np.radians(degrees) / 2)
-        return Lens((fx, fx * size[1] / size[0]))
+        return CameraLens((fx, fx * size[1] / size[0]))
 
     @staticmethod
-    def sample(rng: np.random.Generator, size: tuple[int, int]) -> Lens:
+    def sample(rng: np.random.Generator, size: tuple[int, int]) -> CameraLens:
         """Phones and head-worn cameras (38 to 62 degrees across), webcams and depth cameras (55
         to 82), wide ones on robots (80 to 118)."""
         low, high = LENSES[int(rng.choice(len(LENSES), p=[0.4, 0.42, 0.18]))]
-        return Lens.of_view(float(rng.uniform(low, high)), size)
+        return CameraLens.of_view(float(rng.uniform(low, high)), size)
 
 
 def random_view(
-    space: FreeSpace, rng: np.random.Generator, lens: Lens, interests: np.ndarray
+    space: FreeSpace, rng: np.random.Generator, lens: CameraLens, interests: np.ndarray
 ) -> RenderCamera:
     """One camera at head or robot height that looks about level, more often down than up.
 
@@ -138,7 +138,7 @@ def random_view(
 
 
 def _view_past(
-    space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
+    space: FreeSpace, rng: np.random.Generator, lens: CameraLens, target: np.ndarray
 ) -> RenderCamera | None:
     """A camera with a point near one side of its picture and free space ahead; None if there is
     none."""
@@ -159,7 +159,7 @@ def _view_past(
 
 
 def _view_of(
-    space: FreeSpace, rng: np.random.Generator, lens: Lens, target: np.ndarray
+    space: FreeSpace, rng: np.random.Generator, lens: CameraLens, target: np.ndarray
 ) -> RenderCamera | None:
     """A camera that sees a point from a little above; None when none is found quickly."""
     for _ in range(12):

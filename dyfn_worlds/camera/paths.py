@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
+from dyfn_worlds.camera.cameras import CLEARANCE, CameraLens, FreeSpace, pose_at
 from dyfn_worlds.render.renderer import RenderCamera
 
 RATE = 60.0  # samples a second of a path
@@ -28,7 +28,7 @@ class CameraPath:
 
     positions: np.ndarray
     angles: np.ndarray
-    lens: Lens
+    lens: CameraLens
     pace: str = "walking"
     jitter: float = 0.0
 
@@ -52,7 +52,7 @@ class CameraPath:
 def random_path(
     space: FreeSpace,
     rng: np.random.Generator,
-    lens: Lens,
+    lens: CameraLens,
     seconds: float,
     interests: np.ndarray | None = None,
 ) -> CameraPath:

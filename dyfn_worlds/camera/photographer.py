@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import FreeSpace, Lens, random_view
+from dyfn_worlds.camera.cameras import CameraLens, FreeSpace, random_view
 from dyfn_worlds.camera.paths import CameraPath, random_path
 from dyfn_worlds.camera.staging import LightScript, stage, stand
 from dyfn_worlds.render.occlusion import shade_corners
@@ -90,7 +90,7 @@ class Photographer:
         for _ in range(count * 6):
             if len(views) == count:
                 break
-            lens = Lens.sample(self.rng, self.renderer.size)
+            lens = CameraLens.sample(self.rng, self.renderer.size)
             camera = random_view(self.space, self.rng, lens, self.scene.interests)
             moment = Moment(self._extras(camera), self._lamps(), float(self.rng.uniform(0.6, 1.3)))
             exposure = self.exposure(camera, moment)
@@ -107,7 +107,7 @@ class Photographer:
         Raises ValueError when no path is found on which most views are worth keeping.
         """
         for _ in range(8):
-            lens = Lens.sample(self.rng, self.renderer.size)
+            lens = CameraLens.sample(self.rng, self.renderer.size)
             path = random_path(self.space, self.rng, lens, seconds, self.scene.interests)
             times = (np.arange(count) + 0.5) * seconds / count
             probes = [self.exposure(path.at(t)) for t in times[:: max(1, count // 16)]]
@@ -220,7 +220,7 @@ class Photographer:
         drift = self.rng.normal(0, 0.3, 3)
         t = np.linspace(-0.5, 0.5, 61)[:, None]
         angles = np.array([yaw, pitch, roll]) + t * turn
-        return CameraPath(position + t * drift, angles, Lens(camera.focal), "view")
+        return CameraPath(position + t * drift, angles, CameraLens(camera.focal), "view")
 
     def _extras(self, camera: RenderCamera) -> tuple[Placement, ...]:
         if not self.scene.actors or self.rng.random() < 0.55:

@@ -97,11 +97,11 @@ def test_a_plane_has_no_corner_and_a_crease_has_one() -> None:
 
 
 def test_speeds_of_a_path_are_per_second() -> None:
-    from dyfn_worlds.camera.cameras import Lens
+    from dyfn_worlds.camera.cameras import CameraLens
     from dyfn_worlds.camera.paths import RATE
 
     t = np.arange(121)[:, None] / RATE
-    path = CameraPath(t * [0.5, 0, 0], t * [0.4, 0, 0], Lens((0.8, 1.0)))
+    path = CameraPath(t * [0.5, 0, 0], t * [0.4, 0, 0], CameraLens((0.8, 1.0)))
     metres, degrees = path.speed(1.0)
     assert metres == pytest.approx(0.5, rel=1e-6)
     assert degrees == pytest.approx(np.degrees(0.4), rel=1e-3)

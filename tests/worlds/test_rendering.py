@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dyfn_worlds.camera.cameras import CLEARANCE, FreeSpace, Lens, pose_at
+from dyfn_worlds.camera.cameras import CLEARANCE, CameraLens, FreeSpace, pose_at
 from dyfn_worlds.camera.paths import random_path
 from dyfn_worlds.generate import RoomWorlds, ShardJob, render
 from dyfn_worlds.render.renderer import RenderCamera, Renderer
@@ -82,7 +82,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, renderer: Renderer) 
 
 def test_a_path_keeps_clear_of_every_surface(room: Scene) -> None:
     space, rng = FreeSpace(room), np.random.default_rng(0)
-    path = random_path(space, rng, Lens((0.8, 1.0)), 2.0)
+    path = random_path(space, rng, CameraLens((0.8, 1.0)), 2.0)
     cameras = [path.at(t) for t in np.linspace(0, 2, 31)]
     positions = np.stack([c.pose[:3, 3] for c in cameras])
     assert space.clearance(positions).min() > 0.8 * CLEARANCE / 2

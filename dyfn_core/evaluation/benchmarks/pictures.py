@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence
-from dyfn_core.evaluation.report.pictures import FrameStrip, Snapshot
+from dyfn_core.evaluation.report.pictures import DepthSnapshot, FrameStrip
 from dyfn_core.evaluation.report.worst_frames import WIDTH, WorstFrames
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import SequenceScore
@@ -98,7 +98,7 @@ class BenchmarkPictures:
         taken: SequencePictures,
         frame: int,
         error: float,
-        shown: Snapshot | None,
+        shown: DepthSnapshot | None,
         video: SequenceScore,
     ) -> None:
         picture = None if shown is None else taken.worst.draw([shown], video.scale, video.shift)

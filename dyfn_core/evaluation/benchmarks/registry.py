@@ -25,8 +25,8 @@ from dyfn_core.evaluation.benchmarks.sets.base import (
     Benchmark,
     BenchmarkFrame,
     BenchmarkSequence,
-    Settings,
-    Source,
+    BenchmarkSettings,
+    BenchmarkSource,
     select,
 )
 
@@ -36,8 +36,8 @@ __all__ = [
     "Benchmark",
     "BenchmarkFrame",
     "BenchmarkSequence",
+    "BenchmarkSettings",
     "Opened",
-    "Settings",
     "benchmark",
     "open_benchmark",
 ]
@@ -116,7 +116,7 @@ class Opened:
 
     benchmark: Benchmark
     layout: str
-    settings: Settings
+    settings: BenchmarkSettings
     sequences: list[BenchmarkSequence]
     missing: list[str]
     report: DataReport
@@ -134,7 +134,7 @@ def benchmark(name: str) -> Benchmark:
 def open_benchmark(
     name: str,
     root: Path,
-    settings: Settings | None = None,
+    settings: BenchmarkSettings | None = None,
     *,
     layout: str = AUTO,
     sequences: Sequence[str] = (),
@@ -167,7 +167,7 @@ def open_benchmark(
     return Opened(known, found_layout, settings, chosen, missing, report)
 
 
-def default_settings(known: Benchmark, layout: str) -> Settings:
+def default_settings(known: Benchmark, layout: str) -> BenchmarkSettings:
     """The paper's settings; what DepthCrafter's files have already had done to them is left out."""
     if layout == DEPTHCRAFTER:
         return replace(known.settings, first=0, stride=1, crop=(0, 0))
@@ -187,7 +187,7 @@ def find_layout(known: Benchmark, root: Path, layout: str) -> str:
 
 def _open(
     known: Benchmark, root: Path, layout: str, report: DataReport
-) -> tuple[str, list[Source]]:
+) -> tuple[str, list[BenchmarkSource]]:
     layout = find_layout(known, root, layout)
     expected = known.expected
     if layout == DEPTHCRAFTER:
@@ -208,7 +208,7 @@ def _open(
 def _missing(
     known: Benchmark,
     there: list[BenchmarkSequence],
-    settings: Settings,
+    settings: BenchmarkSettings,
     only: Sequence[str],
 ) -> list[str]:
     """Sequences that are not there, and those with fewer frames than they should have."""

@@ -13,7 +13,7 @@ from dyfn_core.evaluation.benchmarks.table import sequence_table
 from dyfn_core.evaluation.report.html import (
     Cell,
     Part,
-    Picture,
+    ReportPicture,
     Section,
     Table,
     Text,
@@ -58,7 +58,7 @@ def write_benchmark_report(
         name = found["name"]
         parts = _curves(found)
         if name in pictures.strips:
-            parts.insert(0, Picture(pictures.strips[name], f"some frames of {name}"))
+            parts.insert(0, ReportPicture(pictures.strips[name], f"some frames of {name}"))
         sections.append(Section(f"Over time, {name}", parts))
     sections += _worst(pictures.worst)
     times = {name: np.array(values) * 1000 for name, values in seconds.items() if len(values)}
@@ -87,7 +87,7 @@ def _worst(worst: Sequence[WorstFrame]) -> list[Section]:
     parts: list[Part] = [Table(header, rows)]
     shown = [found.picture for found in worst if found.picture is not None]
     if shown:
-        parts.append(Picture(np.vstack(shown), "worst frames, worst first"))
+        parts.append(ReportPicture(np.vstack(shown), "worst frames, worst first"))
     return [Section("Worst frames", [*parts, Text(WORST_NOTE, note=True)])]
 
 

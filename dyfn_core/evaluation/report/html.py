@@ -40,7 +40,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ReportPicture:
     """image: H x W x 3 uint8 RGB. photographic: stored as JPEG, else as PNG."""
 
     image: np.ndarray
@@ -55,7 +55,7 @@ class KeyFigures:
     figures: Mapping[str, Cell]
 
 
-Part = Text | Table | Picture | Curves | Histogram | KeyFigures
+Part = Text | Table | ReportPicture | Curves | Histogram | KeyFigures
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class DepthSnapshot:
     """A frame kept for the strip, already small.
 
     image: h x w x 3 uint8 RGB. depth: h x w, NaN where the prediction is invalid.
@@ -69,14 +69,14 @@ class Snapshot:
 
 def snapshot(
     index: int, image: np.ndarray, depth: np.ndarray, truth: np.ndarray | None, width: int
-) -> Snapshot:
-    """Arrays as in Snapshot, of any size -> `width` pixels wide."""
+) -> DepthSnapshot:
+    """Arrays as in DepthSnapshot, of any size -> `width` pixels wide."""
     size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     depth = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
     if truth is not None:
         truth = cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST)
-    return Snapshot(index, small, depth, truth)
+    return DepthSnapshot(index, small, depth, truth)
 
 
 class FrameStrip:
@@ -92,12 +92,12 @@ class FrameStrip:
         last = max(expected_frames - 1, 0)
         self.wanted = {round(i) for i in np.linspace(0, last, min(count, last + 1))}
         self.width = width
-        self.snapshots: list[Snapshot] = []
+        self.snapshots: list[DepthSnapshot] = []
 
     def add(
         self, index: int, image: np.ndarray, depth: np.ndarray, truth: np.ndarray | None
     ) -> None:
-        """Keep the frame if it is one of the wanted ones; arrays as in Snapshot, any size."""
+        """Keep the frame if it is one of the wanted ones; arrays as in DepthSnapshot, any size."""
         if index not in self.wanted:
             return
         self.snapshots.append(snapshot(index, image, depth, truth, self.width))
@@ -122,7 +122,7 @@ class FrameStrip:
         return np.vstack([_captions(names, self.width, unit), *rows])
 
     def _row(
-        self, snapshot: Snapshot, depth: np.ndarray, near: float, far: float, with_truth: bool
+        self, snapshot: DepthSnapshot, depth: np.ndarray, near: float, far: float, with_truth: bool
     ) -> np.ndarray:
         image = snapshot.image.copy()
         _write(image, f"{snapshot.index}", (4, image.shape[0] - 6))

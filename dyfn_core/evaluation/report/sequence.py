@@ -12,7 +12,7 @@ from dyfn_core.evaluation.report.html import (
     Cell,
     KeyFigures,
     Part,
-    Picture,
+    ReportPicture,
     Section,
     Table,
     Text,
@@ -55,11 +55,11 @@ def sequence_sections(
         Section("Scores", scores),
         *_over_time(runs),
         *(
-            Section(f"Frames, {name}", [Picture(run.draw_strip(), f"some frames, {name}")])
+            Section(f"Frames, {name}", [ReportPicture(run.draw_strip(), f"some frames, {name}")])
             for name, run in runs.items()
         ),
         *(
-            Section(f"Cloud, {name}", [Picture(cloud, f"cloud, {name}")])
+            Section(f"Cloud, {name}", [ReportPicture(cloud, f"cloud, {name}")])
             for name, cloud in (clouds or {}).items()
         ),
         *(section for name, run in runs.items() for section in _worst(name, run)),
@@ -123,7 +123,9 @@ def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
     header = ("worst first", "stamp, s", "AbsRel", "picture")
     parts: list[Part] = [Table(header, table), Text(WORST_NOTE, note=True)]
     if shown:
-        parts.insert(1, Picture(run.worst.draw(shown, video.scale, video.shift), "worst frames"))
+        parts.insert(
+            1, ReportPicture(run.worst.draw(shown, video.scale, video.shift), "worst frames")
+        )
     return [Section(f"Worst frames, {name}", parts)]
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.evaluation.report.pictures import FrameStrip, Snapshot, snapshot
+from dyfn_core.evaluation.report.pictures import DepthSnapshot, FrameStrip, snapshot
 from dyfn_core.prediction import DEPTH, DISPARITY
 from dyfn_core.scoring.frame_scores import FrameScore
 
@@ -19,7 +19,7 @@ WIDTH = 200
 @dataclass(frozen=True)
 class _Candidate:
     badness: float
-    snapshot: Snapshot
+    snapshot: DepthSnapshot
 
 
 class WorstFrames:
@@ -48,7 +48,7 @@ class WorstFrames:
             return
         ratio = self._log_ratio(depth, truth)
         reasons = (-ratio, ratio, score.metrics["abs_rel"])
-        small: Snapshot | None = None
+        small: DepthSnapshot | None = None
         for badness, kept in zip(reasons, self._kept, strict=True):
             if self._enters(kept, index, badness):
                 small = small or snapshot(index, image, depth, truth, WIDTH)
@@ -80,13 +80,13 @@ class WorstFrames:
             chosen.setdefault(index // self.stretch, index)
         return list(chosen.values())
 
-    def nearest(self, index: int, errors: np.ndarray) -> Snapshot | None:
+    def nearest(self, index: int, errors: np.ndarray) -> DepthSnapshot | None:
         """The kept frame of the same stretch with the largest error; None when none was kept."""
         place = index // self.stretch
         found = [kept[place].snapshot for kept in self._kept if place in kept]
         return max(found, key=lambda s: np.nan_to_num(errors[s.index]), default=None)
 
-    def draw(self, snapshots: Sequence[Snapshot], scale: float, shift: float) -> np.ndarray:
+    def draw(self, snapshots: Sequence[DepthSnapshot], scale: float, shift: float) -> np.ndarray:
         """One row a frame, as FrameStrip.draw."""
         strip = FrameStrip(0, width=WIDTH, quantity=self.quantity)
         strip.snapshots = list(snapshots)

@@ -20,7 +20,7 @@ from dyfn_core.losses.sampled.normal import normal_loss
 from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.target import target_from_depth
 from dyfn_core.models.checkpoints import load_model
-from dyfn_core.models.efficientnet import Block, EfficientNetLite0
+from dyfn_core.models.efficientnet import EfficientNetLite0, InvertedResidual
 from dyfn_core.models.mini import MiniConfig, MiniModel, remap_exp
 from dyfn_core.training.config import BaseRunConfig, ConfigError, RunConfig
 from dyfn_core.training.loop.processes import full_precision, part_seed, share_of
@@ -172,7 +172,7 @@ def freeze_encoder(encoder: EfficientNetLite0, blocks: int, depthwise: bool) -> 
     for module in frozen:
         module.requires_grad_(False)
     for block in encoder.blocks:
-        if depthwise and isinstance(block, Block):
+        if depthwise and isinstance(block, InvertedResidual):
             block.depthwise.requires_grad_(False)
 
 

@@ -25,7 +25,7 @@ from dyfn_ros.node.parameters.table import (
     LIMITS,
     SPECS,
     START,
-    Settings,
+    NodeSettings,
     Spec,
     groups,
     show,
@@ -134,7 +134,7 @@ class NodeParameters:
         self._by_camera = {camera: self._read(camera) for camera in self._own}
         node.add_post_set_parameters_callback(self._changed)
 
-    def camera(self, name: str) -> Settings:
+    def camera(self, name: str) -> NodeSettings:
         """The settings of one camera."""
         return self._by_camera[name]
 
@@ -157,10 +157,10 @@ class NodeParameters:
             raise InvalidParameterValueException(camera, str(values), f"{camera}: {reason}")
         return own
 
-    def _read(self, camera: str) -> Settings:
+    def _read(self, camera: str) -> NodeSettings:
         own = self._own.get(camera, {})
         values = {name: self._node.get_parameter(own.get(name, name)).value for name in SPECS}
-        return Settings(**values)
+        return NodeSettings(**values)
 
     def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
         declared = {

@@ -20,7 +20,7 @@ __all__ = [
     "RUN",
     "SPECS",
     "START",
-    "Settings",
+    "NodeSettings",
     "Spec",
     "groups",
     "show",
@@ -30,7 +30,7 @@ _NODE, _INPUT, _OUTPUT, _CLOUD = "Node", "Input", "Output", "Cloud"
 
 
 @dataclass(frozen=True)
-class Settings(ReferenceOptions, StreamOptions):
+class NodeSettings(ReferenceOptions, StreamOptions):
     """The values in force; a new one for each change. The fields are the table."""
 
     cameras: list[str] = _parameter(
@@ -206,7 +206,7 @@ class Settings(ReferenceOptions, StreamOptions):
         return self.reliability == "reliable"
 
 
-SPECS: dict[str, Spec] = {entry.name: spec_of(entry) for entry in fields(Settings)}
+SPECS: dict[str, Spec] = {entry.name: spec_of(entry) for entry in fields(NodeSettings)}
 
 # Pairs of a lower and an upper limit; an upper limit of 0 is none.
 LIMITS = (("min_depth", "max_depth"), ("points_min_depth", "points_max_depth"))

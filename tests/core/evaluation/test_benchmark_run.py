@@ -20,7 +20,11 @@ from dyfn_core.evaluation.benchmarks.model_method import ModelMethod, as_array
 from dyfn_core.evaluation.benchmarks.pictures import STRIPS, WORST, BenchmarkPictures
 from dyfn_core.evaluation.benchmarks.predictions import ArrayMethod
 from dyfn_core.evaluation.benchmarks.published import published, published_rows
-from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Settings, open_benchmark
+from dyfn_core.evaluation.benchmarks.registry import (
+    BenchmarkSequence,
+    BenchmarkSettings,
+    open_benchmark,
+)
 from dyfn_core.evaluation.benchmarks.run import Scoring, evaluate, mean_of
 from dyfn_core.evaluation.benchmarks.table import HEADER
 from dyfn_core.evaluation.report.html import Table
@@ -278,7 +282,7 @@ def test_error_grows_with_length_and_each_length_is_fitted_anew(tmp_path: Path) 
     errors = [results["lengths"][n]["variants"]["drift"]["video"]["abs_rel"] for n in "1369"]
     assert errors[0] < 1e-3 < errors[1] < errors[2] < errors[3]
     for length in (3, 6):
-        short = open_benchmark("tum", tmp_path, Settings(frames=length, depth_max=10))
+        short = open_benchmark("tum", tmp_path, BenchmarkSettings(frames=length, depth_max=10))
         alone = evaluate(short, method, Scoring(temporal=False))
         found = results["lengths"][str(length)]["variants"]["drift"]
         assert found["video"] == alone["variants"]["drift"]["video"]

@@ -13,7 +13,7 @@ from dyfn_core.evaluation.benchmarks.registry import (
     BENCHMARKS,
     BenchmarkFrame,
     BenchmarkSequence,
-    Settings,
+    BenchmarkSettings,
     open_benchmark,
 )
 from tests.support.made_benchmarks import (
@@ -46,7 +46,7 @@ def known_truth(index: int, size: tuple[int, int]) -> np.ndarray:
 
 
 def only(
-    name: str, root: Path, settings: Settings | None = None, **options: bool
+    name: str, root: Path, settings: BenchmarkSettings | None = None, **options: bool
 ) -> BenchmarkSequence:
     (sequence,) = open_benchmark(name, root, settings, allow_missing=True, **options).sequences
     return sequence
@@ -166,7 +166,7 @@ def test_bonn_takes_frames_30_to_139_and_no_pose(tmp_path: Path) -> None:
     make_tum(tmp_path / "rgbd_bonn_crowd2", 34)
     sequence = only("bonn", tmp_path)
     assert sequence.numbers == (30, 31, 32, 33)
-    assert BENCHMARKS["bonn"].settings == Settings(first=30, frames=110, depth_max=10)
+    assert BENCHMARKS["bonn"].settings == BenchmarkSettings(first=30, frames=110, depth_max=10)
     for number, frame in zip(sequence.numbers, sequence.frames(), strict=True):
         check(frame, number, TUM_SIZE, 1 / 5000)
         assert frame.pose is None and frame.camera_matrix is not None
@@ -280,13 +280,15 @@ def test_what_the_paper_says_is_the_default() -> None:
 
 def test_settings_are_overridden(tmp_path: Path) -> None:
     make_scannet(tmp_path, "scene0707_00", 9)
-    sequence = only("scannet", tmp_path, Settings(first=1, stride=2, frames=3, crop=(0, 20)))
+    sequence = only(
+        "scannet", tmp_path, BenchmarkSettings(first=1, stride=2, frames=3, crop=(0, 20))
+    )
     assert sequence.numbers == (1, 3, 5)
     assert next(sequence.frames()).truth.shape == (120, 120)
     with pytest.raises(FrameError, match="leaves nothing"):
-        next(only("scannet", tmp_path, Settings(crop=(60, 0))).frames())
+        next(only("scannet", tmp_path, BenchmarkSettings(crop=(60, 0))).frames())
     with pytest.raises(ValueError, match="stride"):
-        Settings(stride=0)
+        BenchmarkSettings(stride=0)
 
 
 def test_unknown_names_and_empty_roots_are_named(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dyfn_core.evaluation.report.html import (
-    Picture,
+    ReportPicture,
     Section,
     Table,
     Text,
@@ -114,8 +114,8 @@ def test_the_report_is_one_file_that_escapes_its_text(tmp_path: Path) -> None:
     parts = [
         Text("a < b", note=True),
         Table(("name", "x"), [["<b>", 0.12345], ["none", None]]),
-        Picture(np.zeros((4, 4, 3), np.uint8), 'black "square"'),
-        Picture(np.zeros((4, 4, 3), np.uint8), "curve", photographic=False),
+        ReportPicture(np.zeros((4, 4, 3), np.uint8), 'black "square"'),
+        ReportPicture(np.zeros((4, 4, 3), np.uint8), "curve", photographic=False),
     ]
     write_report(tmp_path / "report.html", "Title & more", [Section("S", parts)])
     page = (tmp_path / "report.html").read_text()

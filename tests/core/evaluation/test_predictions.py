@@ -13,7 +13,7 @@ import pytest
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.predictions import ArrayMethod, PredictionFolder
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.evaluation.benchmarks.sets.base import Source
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkSource
 
 SIZE = (6, 8)
 ALL = [depth.astype(np.float32) for depth in np.random.default_rng(0).uniform(1, 5, (6, *SIZE))]
@@ -21,7 +21,7 @@ ALL = [depth.astype(np.float32) for depth in np.random.default_rng(0).uniform(1,
 
 def sequence(numbers: tuple[int, ...] = (11, 13, 15)) -> BenchmarkSequence:
     """Frames 11, 13, 15 of the six frames 10..15."""
-    source = Source("room/one", range(10, 16), lambda chosen: iter(()))
+    source = BenchmarkSource("room/one", range(10, 16), lambda chosen: iter(()))
     return BenchmarkSequence("room/one", numbers, 6, source)
 
 

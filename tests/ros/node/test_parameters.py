@@ -13,7 +13,7 @@ from dyfn_core.stream.options import StreamOptions, options_of
 from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.node.parameters import docs as parameter_docs
 from dyfn_ros.node.parameters.declare import check, check_cameras, usage
-from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, Settings
+from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, NodeSettings
 
 ROOT = Path(__file__).parents[3]
 
@@ -37,7 +37,7 @@ def test_a_cameras_file_sets_parameters_that_are_allowed(path: Path) -> None:
     assert check_cameras(values.get("cameras", [""])) == ""
     for camera in (values, *own.values()):
         assert set(camera) <= set(SPECS)
-        assert check(camera, vars(Settings())) == ""
+        assert check(camera, vars(NodeSettings())) == ""
         for name, value in camera.items():
             assert type(value) is type(SPECS[name].default), name
     assert all(SPECS[name].per_camera for camera in own.values() for name in camera)
@@ -63,8 +63,8 @@ def test_a_manual_without_a_place_for_the_table_is_refused() -> None:
 
 
 def test_every_default_has_the_type_of_its_field_and_lies_in_its_range() -> None:
-    defaults = Settings()
-    for field in fields(Settings):
+    defaults = NodeSettings()
+    for field in fields(NodeSettings):
         spec = SPECS[field.name]
         assert getattr(defaults, field.name) == spec.default
         kind = "list[str]" if isinstance(spec.default, list) else type(spec.default).__name__
@@ -85,7 +85,7 @@ def test_stream_parameters_are_the_stream_s_options_with_the_same_defaults() -> 
         )
         assert spec.per_camera
         assert spec.changes == (RUN if option.live else CONFIGURE)
-    node, stream = Settings(), StreamOptions()
+    node, stream = NodeSettings(), StreamOptions()
     assert all(getattr(node, name) == getattr(stream, name) for name in options_of(StreamOptions))
 
 
@@ -151,7 +151,7 @@ def test_names_of_cameras_make_topics_or_are_refused(names: list[str], reason: s
 def test_auto_reliability_follows_drop_frames(
     reliability: str, drop_frames: bool, reliable: bool
 ) -> None:
-    assert Settings(reliability=reliability, drop_frames=drop_frames).reliable is reliable
+    assert NodeSettings(reliability=reliability, drop_frames=drop_frames).reliable is reliable
 
 
 def test_help_shows_parameters_and_strange_arguments_are_refused(

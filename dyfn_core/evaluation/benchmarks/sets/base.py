@@ -30,7 +30,7 @@ class BenchmarkFrame:
 
 
 @dataclass(frozen=True)
-class Settings:
+class BenchmarkSettings:
     """What of every sequence is scored (paper section 5).
 
     first: frames left out at the start. stride: every N-th frame from there on. frames: at
@@ -57,7 +57,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Source:
+class BenchmarkSource:
     """All frames of one sequence on disk, in the order of time.
 
     numbers: their numbers as in the file names. read: the frames of given numbers (a rising
@@ -76,7 +76,7 @@ class BenchmarkSequence:
     name: str
     numbers: tuple[int, ...]
     available: int
-    source: Source
+    source: BenchmarkSource
     crop: tuple[int, int] = (0, 0)
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class BenchmarkSequence:
 
 
 UNREADABLE = "sequence that cannot be read"  # a report's reason; such a sequence is missing
-Opener = Callable[[Path, DataReport], list[Source]]
+Opener = Callable[[Path, DataReport], list[BenchmarkSource]]
 
 
 @dataclass(frozen=True)
@@ -104,14 +104,14 @@ class Benchmark:
     name: str
     title: str
     expected: str
-    settings: Settings
+    settings: BenchmarkSettings
     open: Opener
     sequences: tuple[str, ...] = ()
     lengths: Mapping[str, int] = field(default_factory=dict)
     video_set: str | None = None
 
 
-def select(source: Source, settings: Settings) -> BenchmarkSequence:
+def select(source: BenchmarkSource, settings: BenchmarkSettings) -> BenchmarkSequence:
     """The frames of a source that the settings choose."""
     chosen = tuple(source.numbers[settings.first :: settings.stride][: settings.frames])
     return BenchmarkSequence(source.name, chosen, len(source.numbers), source, settings.crop)

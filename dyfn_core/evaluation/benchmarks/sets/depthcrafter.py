@@ -11,7 +11,7 @@ import numpy as np
 
 from dyfn_core.data.frames import DataReport, FrameError
 from dyfn_core.evaluation.benchmarks.arrays import frames_of_array, npz_key
-from dyfn_core.evaluation.benchmarks.sets.base import UNREADABLE, BenchmarkFrame, Source
+from dyfn_core.evaluation.benchmarks.sets.base import UNREADABLE, BenchmarkFrame, BenchmarkSource
 
 EXPECTED = (
     "<set>/<sequence>_rgb_left.mp4 and <set>/<sequence>_disparity.npz, whose key `disparity` "
@@ -29,7 +29,7 @@ def video_folder(root: Path, video_set: str) -> Path | None:
     return None
 
 
-def open_videos(folder: Path, report: DataReport) -> list[Source]:
+def open_videos(folder: Path, report: DataReport) -> list[BenchmarkSource]:
     """Sequences by the name before `_rgb_left.mp4`. Truth <= 0 is invalid (0 or -1 in the files).
 
     Truth is paired with its video by name. There is no camera and no pose. Pairs
@@ -47,7 +47,7 @@ def open_videos(folder: Path, report: DataReport) -> list[Source]:
         except FrameError as error:
             report.miss(UNREADABLE, error)
             continue
-        found.append(Source(name, range(shape[0]), partial(_read, video, truth)))
+        found.append(BenchmarkSource(name, range(shape[0]), partial(_read, video, truth)))
     for truth in sorted(folder.glob(f"*{TRUTH}")):
         if not truth.with_name(truth.name.removesuffix(TRUTH) + VIDEO).exists():
             report.miss(f"truth without its {VIDEO}", truth)

@@ -10,13 +10,18 @@ import numpy as np
 
 from dyfn_core.data.files import folders_holding, numbered_files, read_colour, read_uint16
 from dyfn_core.data.frames import DataReport, FrameError
-from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
+from dyfn_core.evaluation.benchmarks.sets.base import (
+    BenchmarkFrame,
+    BenchmarkSettings,
+    BenchmarkSource,
+    one_by_one,
+)
 
 EXPECTED = (
     "[val/]<drive>/proj_depth/groundtruth/image_02/0000000005.png and, in the root or raw/, "
     "<date>/<drive>/image_02/data/0000000005.png (and <date>/calib_cam_to_cam.txt)"
 )
-SETTINGS = Settings(frames=110, depth_max=80)
+SETTINGS = BenchmarkSettings(frames=110, depth_max=80)
 UNIT = 256.0  # stored values a metre
 DRIVES = tuple(
     f"{drive}_sync"
@@ -30,7 +35,7 @@ DRIVES = tuple(
 )
 
 
-def open_kitti(root: Path, report: DataReport) -> list[Source]:
+def open_kitti(root: Path, report: DataReport) -> list[BenchmarkSource]:
     """The left colour camera; uint16 / 256 metres, 0 invalid. Frames are those with truth."""
     found = []
     for folder in folders_holding(root, "proj_depth", 3):
@@ -43,7 +48,7 @@ def open_kitti(root: Path, report: DataReport) -> list[Source]:
         files = {n: (images[n], depths[n]) for n in depths if n in images}
         if files:
             reader = partial(_read, files, _camera_matrix(root, folder.name, report))
-            found.append(Source(folder.name, list(files), one_by_one(reader)))
+            found.append(BenchmarkSource(folder.name, list(files), one_by_one(reader)))
     return found
 
 

@@ -16,19 +16,19 @@ from dyfn_core.data.rgbd.layouts import (
 )
 from dyfn_core.evaluation.benchmarks.sets.base import (
     UNREADABLE,
-    Settings,
-    Source,
+    BenchmarkSettings,
+    BenchmarkSource,
     from_rgbd,
     one_by_one,
 )
 
 __all__ = ["EXPECTED", "SETTINGS", "open_rgbd", "rgbd_sources"]
 
-SETTINGS = Settings()
+SETTINGS = BenchmarkSettings()
 LEVELS = 3  # folders below the root that are searched
 
 
-def open_rgbd(root: Path, report: DataReport) -> list[Source]:
+def open_rgbd(root: Path, report: DataReport) -> list[BenchmarkSource]:
     """Every folder of a known layout, named by its path below the root."""
 
     def below(folder: Path) -> str:
@@ -43,7 +43,7 @@ def rgbd_sources(
     report: DataReport,
     *,
     named: Callable[[Path], str],
-) -> list[Source]:
+) -> list[BenchmarkSource]:
     """One source per folder of these layouts, without cuts at gaps.
 
     Args:
@@ -63,5 +63,5 @@ def rgbd_sources(
             continue
         if sequence is not None:
             read = one_by_one(lambda number, reader=sequence.reader: from_rgbd(reader(number)))  # type: ignore[misc]
-            found.append(Source(named(path), list(sequence.numbers), read))
+            found.append(BenchmarkSource(named(path), list(sequence.numbers), read))
     return found

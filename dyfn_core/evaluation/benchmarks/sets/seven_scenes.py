@@ -6,11 +6,11 @@ from pathlib import Path
 
 from dyfn_core.data.frames import DataReport
 from dyfn_core.data.rgbd.layouts import SEVEN_SCENES
-from dyfn_core.evaluation.benchmarks.sets.base import Settings, Source
+from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkSettings, BenchmarkSource
 from dyfn_core.evaluation.benchmarks.sets.rgbd import rgbd_sources
 
 EXPECTED = "<scene>/seq-01/ with frame-000000.color.png, .depth.png and .pose.txt"
-SETTINGS = Settings(depth_max=10)
+SETTINGS = BenchmarkSettings(depth_max=10)
 TEST_SPLIT = {
     "chess": (3, 5),
     "fire": (3, 4),
@@ -25,7 +25,7 @@ SEQUENCES = tuple(
 )
 
 
-def open_seven_scenes(root: Path, report: DataReport) -> list[Source]:
+def open_seven_scenes(root: Path, report: DataReport) -> list[BenchmarkSource]:
     """uint16 millimetres, 0 and 65535 invalid; 585, 585, 320, 240 as intrinsics."""
     return rgbd_sources(
         root,

@@ -10,13 +10,18 @@ import numpy as np
 from dyfn_core.data.axes import inverse
 from dyfn_core.data.files import numbered_files, read_colour, with_depth
 from dyfn_core.data.frames import DataReport, FrameError
-from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, Settings, Source, one_by_one
+from dyfn_core.evaluation.benchmarks.sets.base import (
+    BenchmarkFrame,
+    BenchmarkSettings,
+    BenchmarkSource,
+    one_by_one,
+)
 
 EXPECTED = (
     "training/{clean,final}/<sequence>/frame_0001.png and "
     "training/depth/<sequence>/frame_0001.dpt (and camdata_left/<sequence>/frame_0001.cam)"
 )
-SETTINGS = Settings(frames=50, depth_max=70)
+SETTINGS = BenchmarkSettings(frames=50, depth_max=70)
 TAG = np.float32(202021.25)  # how .dpt and .cam files begin
 LENGTHS = {
     **dict.fromkeys(("alley_1", "alley_2"), 50),
@@ -28,7 +33,9 @@ LENGTHS = {
 }
 
 
-def open_sintel(root: Path, report: DataReport, render_pass: str = "clean") -> list[Source]:
+def open_sintel(
+    root: Path, report: DataReport, render_pass: str = "clean"
+) -> list[BenchmarkSource]:
     """render_pass: "clean" (what the paper's numbers are of) or "final" (with blur and fog).
 
     Poses and intrinsics come from `camdata_left` where it is there.
@@ -43,7 +50,7 @@ def open_sintel(root: Path, report: DataReport, render_pass: str = "clean") -> l
         files = with_depth(images, depths, report)
         if files:
             reader = partial(_read, files, cameras)
-            found.append(Source(folder.name, list(files), one_by_one(reader)))
+            found.append(BenchmarkSource(folder.name, list(files), one_by_one(reader)))
     return found
 
 
