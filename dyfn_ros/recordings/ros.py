@@ -56,7 +56,7 @@ class BagRecording:
     def frames(self) -> Iterator[RecordedFrame]:
         """See Recording."""
         self.notes = Notes()
-        self.notes.warnings.update(self.topics.remarks)
+        self.notes.warnings.update((*self.topics.remarks, *self._storage.remarks))
         infos = _Infos(self._first(self.topics.camera_info), self._unusable)
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
         calibrator = Rectifier(self._unusable)

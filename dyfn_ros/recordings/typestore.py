@@ -43,16 +43,26 @@ def camera_info(
     """A CameraInfo: K and P from the 3 x 3 matrix; D zero unless there is a lens."""
     matrix = np.asarray(camera_matrix, np.float64)
     lens = lens or Lens("plumb_bob", (0.0,) * 5)
+    arrays = {
+        "d": np.array(lens.coefficients, np.float64),
+        "k": matrix.reshape(9),
+        "r": np.eye(3).reshape(9),
+        "p": np.hstack([matrix, np.zeros((3, 1))]).reshape(12),
+    }
+    return calibration_message(header(stamp_ns, frame_id), size, lens.model, arrays)
+
+
+def calibration_message(
+    head: Any, size: tuple[int, int], model: str, arrays: dict[str, np.ndarray]
+) -> Any:
+    """A CameraInfo of the whole sensor; arrays: float64 d, k (9), r (9) and p (12)."""
     return _new(
         CAMERA_INFO,
-        header=header(stamp_ns, frame_id),
+        header=head,
         height=size[0],
         width=size[1],
-        distortion_model=lens.model,
-        d=np.array(lens.coefficients, np.float64),
-        k=matrix.reshape(9),
-        r=np.eye(3).reshape(9),
-        p=np.hstack([matrix, np.zeros((3, 1))]).reshape(12),
+        distortion_model=model,
+        **arrays,
         binning_x=0,
         binning_y=0,
         roi=_new(
@@ -73,15 +83,23 @@ def _new(kind: str, **fields: Any) -> Any:
 def image_message(pixels: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Any:
     """A raw Image of H x W (x C) pixels, whose dtype must be that of the encoding."""
     pixels = np.ascontiguousarray(pixels)
+    data, size = pixels.view(np.uint8).reshape(-1), (pixels.shape[0], pixels.shape[1])
+    return raw_message(header(stamp_ns, frame_id), size, encoding, pixels.strides[0], data)
+
+
+def raw_message(
+    head: Any, size: tuple[int, int], encoding: str, step: int, data: np.ndarray
+) -> Any:
+    """A raw little-endian Image of H x W pixels; step: bytes of a row, data: 1-D uint8."""
     return _new(
         IMAGE,
-        header=header(stamp_ns, frame_id),
-        height=pixels.shape[0],
-        width=pixels.shape[1],
+        header=head,
+        height=size[0],
+        width=size[1],
         encoding=encoding,
         is_bigendian=0,
-        step=pixels.strides[0],
-        data=pixels.view(np.uint8).reshape(-1),
+        step=step,
+        data=data,
     )
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -73,10 +74,11 @@ class Topic:
 class Storage(Protocol):
     """An opened recording.
 
-    topics: name -> Topic.
+    topics: name -> Topic. remarks: what is odd about the files and costs no message.
     """
 
     topics: dict[str, Topic]
+    remarks: Sequence[str]
 
     @property
     def losses(self) -> list[str]:
@@ -104,6 +106,20 @@ class Losses:
     def sentences(self) -> list[str]:
         """All of them."""
         return [*self._sentences, *([f"and {self._more} more"] if self._more else [])]
+
+
+def ros_type(name: str) -> str:
+    """A message type as ROS 2 writes it now: package/msg/Name.
+
+    Older recordings and other recorders write package/Name, package::msg::Name,
+    package.msg.Name or, after DDS, package::msg::dds_::Name_.
+    """
+    parts = re.split(r"::|[/.]", name)
+    inner = parts[1:-1]
+    if len(parts) < 2 or any(part not in ("msg", "dds_") for part in inner):
+        return name
+    last = parts[-1].removesuffix("_") if "dds_" in inner else parts[-1]
+    return f"{parts[0]}/msg/{last}"
 
 
 def count_topics(found: Iterable[Recorded]) -> dict[str, Topic]:

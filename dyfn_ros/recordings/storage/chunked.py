@@ -50,6 +50,8 @@ class ChunkedFile(ABC):
     Chunks that cannot be read are left out, whatever is behind them is read.
     """
 
+    remarks: Sequence[str] = ()
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.size = path.stat().st_size

@@ -32,10 +32,10 @@ from dyfn_ros.recordings.storage.base import (
     Recorded,
     Topic,
     decompress,
-    plain,
     reason,
 )
 from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
+from dyfn_ros.recordings.storage.mcap_forms import Form, message_form
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -59,31 +59,34 @@ class McapFile(ChunkedFile):
     """See ChunkedFile. The index is the summary section, if it is whole and fits the file."""
 
     _expected: int | None = None  # messages, as the summary says
-    _schemas: dict[int, str]
+    _schemas: dict[int, Schema]
     _channels: dict[int, Channel]
+    _forms: dict[str, Form]  # of topics
     _chunked: bool
 
     def _read_index(self) -> Index | None:
         summary = list(self._summary())
-        names = {r.id: r.name for r in summary if isinstance(r, Schema)}
+        self._schemas = {r.id: r for r in summary if isinstance(r, Schema)}
+        self._forms = {}
         channels = {r.id: r for r in summary if isinstance(r, Channel)}
         statistics = [r for r in summary if isinstance(r, Statistics)]
         chunks = [r for r in summary if isinstance(r, ChunkIndex)]
         if not statistics or not channels or not chunks:
             return None
         self._expected = statistics[0].message_count
-        if len(chunks) != statistics[0].chunk_count:
+        schemas = {channel.schema_id for channel in channels.values() if channel.schema_id}
+        if len(chunks) != statistics[0].chunk_count or not schemas <= set(self._schemas):
             return None
         topics: dict[str, Topic] = {}
         for key, channel in channels.items():
-            if channel.message_encoding == "cdr":
-                kind, count = names[channel.schema_id], statistics[0].channel_message_counts
-                known = topics.get(channel.topic, Topic(kind, 0))
+            form, count = self._form(channel), statistics[0].channel_message_counts
+            if form is not None:
+                known = topics.get(channel.topic, Topic(form.kind, 0))
                 topics[channel.topic] = Topic(known.kind, known.count + count.get(key, 0))
         spans = self._spans(chunks)
         if spans is None:
             return None
-        self._schemas, self._channels = names, channels
+        self._channels = channels
         return Index(spans, {k: c.topic for k, c in channels.items()}, topics)
 
     def _summary(self) -> Iterator[McapRecord]:
@@ -138,22 +141,33 @@ class McapFile(ChunkedFile):
             if opcode == Opcode.MESSAGE:
                 message = Message.read(ReadDataStream(BytesIO(content)), len(content))
                 channel = self._channels[message.channel_id]
-                if channel.message_encoding == "cdr":
-                    kind = self._schemas.get(channel.schema_id, "")
-                    yield Recorded(channel.topic, kind, message.log_time, message.data)
+                form = self._form(channel)
+                if form is not None:
+                    yield Recorded(channel.topic, form.kind, message.log_time, message.data)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 record: Any = parse(opcode, content)
                 if opcode == Opcode.SCHEMA:
-                    self._schemas[record.id] = record.name
+                    self._schemas[record.id] = record
                 else:
                     self._channels[record.id] = record
 
+    def _form(self, channel: Channel) -> Form | None:
+        """How its messages are read; None beside another encoding of the topic, which counts."""
+        form = self._forms.get(channel.topic)
+        if form is None:
+            schema = self._schemas.get(channel.schema_id)
+            form = message_form(channel.message_encoding, schema)
+            if schema is not None:
+                self._forms[channel.topic] = form
+        return form if form.encoding == channel.message_encoding else None
+
     def _finish(self, recorded: Recorded) -> Recorded:
-        return recorded._replace(data=plain(recorded.data))
+        form = self._forms.get(recorded.topic)
+        return recorded if form is None else recorded._replace(data=form.to_cdr(recorded.data))
 
     def _scan(self) -> Iterator[Recorded]:
         self._lost = Losses()
-        self._schemas, self._channels = {}, {}
+        self._schemas, self._channels, self._forms = {}, {}, {}
         self._chunked = False
         count = 0
         with (

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
 import yaml
@@ -14,6 +16,7 @@ import zstandard
 from dyfn_core.data.files import hidden
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.storage.base import DAMAGE, Recorded, Storage, Topic, reason
+from dyfn_ros.recordings.storage.heads import kind_by_head, strange_head
 from dyfn_ros.recordings.storage.mcap import McapFile
 from dyfn_ros.recordings.storage.rosbag1 import Bag1File
 from dyfn_ros.recordings.storage.sqlite import SqliteFile
@@ -38,8 +41,11 @@ class ChainedStorage:
     losses: of what was no readable file at all.
     """
 
-    def __init__(self, parts: Sequence[Storage], losses: Sequence[str] = ()) -> None:
+    def __init__(
+        self, parts: Sequence[Storage], losses: Sequence[str] = (), remarks: Sequence[str] = ()
+    ) -> None:
         self.parts = parts
+        self.remarks = remarks
         self._lost = losses
         self.topics: dict[str, Topic] = {}
         for part in parts:
@@ -95,14 +101,13 @@ def open_storage(path: str | Path) -> Storage:
 
 
 def _is_file(path: Path) -> bool:
-    name = path.stem if path.suffix in PACKED else path.name
-    return name.endswith(SUFFIXES)
+    return _plain_name(path).endswith(SUFFIXES)
 
 
 def _files(folder: Path) -> list[Path]:
     """Recordings in a folder in natural order of their names, each once."""
     found = {
-        (f.stem if f.suffix in PACKED else f.name): f
+        _plain_name(f): f
         for f in sorted(folder.iterdir(), key=lambda f: f.suffix not in PACKED)
         if _is_file(f) and f.is_file() and not hidden(f)
     }
@@ -114,39 +119,105 @@ def _natural(name: str) -> list[int | str]:
 
 
 def _open_folder(path: Path) -> Storage:
-    files, problem = _files(path), ""
-    losses: list[str] = []
-    if (path / "metadata.yaml").exists():
-        try:
-            listed = [path / name for name in _listed(path / "metadata.yaml")]
-            losses = [
-                f"{f}: missing, though metadata.yaml lists it" for f in listed if not f.exists()
-            ]
-            files = [f for f in listed if f.exists()] or files
-        except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
-            problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
-    if not files:
+    contents = _contents(path)
+    if not contents.files:
+        inner = [d for d in sorted(path.iterdir()) if d.is_dir() and is_recording(d)]
+        held = f"; it holds {', '.join(map(str, inner))}" if inner else ""
         raise RecordingError(
             f"{path}: expected a rosbag2 folder (metadata.yaml and .mcap or .db3 files) "
-            f"or an RGB-D folder (rgb/, depth/, K.txt){problem}"
+            f"or an RGB-D folder (rgb/, depth/, K.txt){held}{contents.problem}"
         )
-    parts = []
-    for file in files:
+    parts: dict[Path, Storage] = {}
+    losses: list[str] = []
+    for file in contents.files:
         try:
-            parts.append(_open_file(file))
+            parts[file] = _open_file(file)
         except RecordingError as error:
             losses.append(str(error))
     if not parts:
-        raise RecordingError("; ".join(losses))
-    return ChainedStorage(parts, losses)
+        raise RecordingError("; ".join([*contents.missing, *losses]))
+    found = sum(topic.count for part in parts.values() for topic in part.topics.values())
+    if contents.renamed and not losses and found == contents.messages:
+        remarks = [f"{f}: metadata.yaml names it otherwise" for f in contents.renamed]
+        return ChainedStorage([*parts.values()], (), remarks)
+    listed = {file: part for file, part in parts.items() if file not in contents.renamed}
+    unlisted = [*contents.unlisted, *(contents.renamed if listed else [])]
+    remarks = [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
+    return ChainedStorage([*(listed or parts).values()], [*contents.missing, *losses], remarks)
 
 
-def _listed(metadata: Path) -> list[str]:
-    """File names in the order of recording; old versions have the folder's name before them."""
+@dataclass
+class _Contents:
+    """The files of a folder, in the order of recording.
+
+    missing: sentences about files that metadata.yaml lists and that are not there. renamed:
+    those of `files` that may be the missing ones. unlisted: the others that are not listed.
+    messages: how many there are by metadata.yaml. problem: why that cannot be used.
+    """
+
+    files: list[Path]
+    missing: list[str] = field(default_factory=list)
+    renamed: list[Path] = field(default_factory=list)
+    unlisted: list[Path] = field(default_factory=list)
+    messages: int | None = None
+    problem: str = ""
+
+
+def _contents(path: Path) -> _Contents:
+    """What there is, by metadata.yaml when that can be read."""
+    unlisted = _files(path)
+    if not (path / "metadata.yaml").exists():
+        return _Contents(unlisted)
+    try:
+        names, messages = _listed(path / "metadata.yaml")
+    except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
+        problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
+        return _Contents(unlisted, problem=problem)
+    places = {name: _place(path, name) for name in names}
+    found = [*dict.fromkeys(place for place in places.values() if place is not None)]
+    unlisted = [f for f in unlisted if _plain_name(f) not in {_plain_name(p) for p in found}]
+    missing = [
+        f"{path / name}: missing, though metadata.yaml lists it"
+        for name, place in places.items()
+        if place is None
+    ]
+    if missing and len(unlisted) == len(missing):
+        stand_in = iter(unlisted)
+        files = dict.fromkeys(place or next(stand_in) for place in places.values())
+        return _Contents([*files], missing, renamed=unlisted, messages=messages)
+    if not found:
+        return _Contents(unlisted, missing, messages=messages)
+    return _Contents(found, missing, unlisted=unlisted, messages=messages)
+
+
+def _listed(metadata: Path) -> tuple[list[str], int | None]:
+    """File names in the order of recording, each once, and how many messages they hold."""
     with metadata.open("rb") as file:
-        content = yaml.safe_load(file)
-    names = content["rosbag2_bagfile_information"]["relative_file_paths"]
-    return [PurePath(name).name for name in names]
+        content = yaml.safe_load(file)["rosbag2_bagfile_information"]
+    names = [str(name).replace("\\", "/") for name in content["relative_file_paths"]]
+    by_name = {os.path.normpath(name): name for name in names}
+    count = content.get("message_count")
+    return [*by_name.values()], count if isinstance(count, int) else None
+
+
+def _place(folder: Path, name: str) -> Path | None:
+    """A listed file: where metadata.yaml says, or beside it, packed or unpacked by hand.
+
+    Old versions have the folder's name before the file's. Never outside the folder.
+    """
+    inside = not PurePath(name).is_absolute() and ".." not in PurePath(name).parts
+    beside = folder / PurePath(name).name
+    for stem in (folder / name, beside) if inside else (beside,):
+        plain = stem.with_suffix("") if stem.suffix in PACKED else stem
+        packed = [plain.with_name(plain.name + suffix) for suffix in PACKED]
+        for place in (stem, plain, *packed):
+            if place.is_file():
+                return place
+    return None
+
+
+def _plain_name(path: Path) -> str:
+    return path.stem if path.suffix in PACKED else path.name
 
 
 def _open_file(path: Path) -> Storage:
@@ -154,14 +225,17 @@ def _open_file(path: Path) -> Storage:
         raise RecordingError(f"{path}: expected {EXPECTED}")
     if path.stat().st_size == 0:
         raise RecordingError(f"{path} is empty")
-    if path.suffix in PACKED:
+    packed = path.suffix in PACKED
+    suffix = kind_by_head(path, packed) or path.suffix
+    if packed and suffix == path.suffix:
         return UnpackedStorage(path)
     try:
-        storage = READERS[path.suffix](path)
+        storage = READERS[suffix](path)
     except DAMAGE as error:
         raise RecordingError(f"{path} is not a readable recording: {reason(error)}") from error
     if not storage.topics:
-        reasons = "; ".join(storage.losses) or "it holds no messages"
+        strange = strange_head(path, suffix)
+        reasons = "; ".join(filter(None, [strange, *storage.losses])) or "it holds no messages"
         raise RecordingError(f"{path} is not a readable recording: {reasons}")
     return storage
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from dyfn_ros.recordings.storage.base import (
     count_topics,
     plain,
     reason,
+    ros_type,
 )
 
 _LAST = (1 << 63) - 1
@@ -23,6 +24,8 @@ _LAST = (1 << 63) - 1
 
 class SqliteFile:
     """See Storage. When a page is bad on the way, the rest comes in the order of recording."""
+
+    remarks: Sequence[str] = ()
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -135,7 +138,7 @@ def _topics(database: sqlite3.Connection) -> dict[int, tuple[str, str]]:
     for key, name, kind in database.execute("SELECT id, name, type FROM topics"):
         if not (isinstance(name, str) and isinstance(kind, str)):
             raise TypeError(f"topic {key} has no name or type")
-        found[int(key)] = (name, kind)
+        found[int(key)] = (name, ros_type(kind))
     return found
 
 
