@@ -1,0 +1,248 @@
+"""Depth that is right up to a scale, made steady and metric by the camera's own motion.
+
+One pure step per frame: tracks are triangulated with the odometry's poses (metric.motion), points
+of the last seconds are added (metric.point_memory), the frame's log scale is measured and filtered
+(metric.scale_filter), and a smooth field takes up what one scale leaves wrong (metric.scale_field).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dyfn_core.metric.motion import (
+    MotionOptions,
+    MotionPoints,
+    MotionState,
+    ScaleMeasurement,
+    log_ratios,
+    measure_scale,
+    observe,
+)
+from dyfn_core.metric.point_memory import MemoryOptions, PointMemory, recall, remember
+from dyfn_core.metric.scale_field import FieldOptions, scale_field
+from dyfn_core.metric.scale_filter import FilterOptions, FilterState, predict, update
+
+_DOUBT = 2.5  # factor on a point's sigma: points of one frame err alike
+_SHAPE = 0.11  # standard deviation of log depth that the field leaves to the prediction
+
+
+@dataclass(frozen=True)
+class MotionScaleOptions:
+    """How the scale is found.
+
+    Attributes:
+        motion: triangulation and measurement.
+        memory: of the points of earlier frames.
+        scale: the filter over time.
+        field: None leaves the shape of the prediction alone.
+        field_sigma: largest standard deviation of log depth of a point of the field.
+        field_sigma_pixels: the same for the part from the noise of the pixels.
+        doubt_seconds: time constant of the share of contradicted frames.
+        doubt: share of recent frames in which the odometry contradicts the pictures beyond which
+            no metres are given. With the defaults an odometry has to agree for 2.6 s first.
+    """
+
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    memory: MemoryOptions = field(default_factory=MemoryOptions)
+    scale: FilterOptions = field(default_factory=FilterOptions)
+    field: FieldOptions | None = field(default_factory=FieldOptions)
+    field_sigma: float = 0.5
+    field_sigma_pixels: float = 0.2
+    doubt_seconds: float = 5.0
+    doubt: float = 0.3
+
+
+@dataclass(frozen=True)
+class MotionFrame:
+    """One frame of a stream.
+
+    Attributes:
+        image: H x W x 3 uint8 RGB, without lens distortion.
+        stamp: seconds.
+        camera_matrix: 3 x 3, pixels.
+        pose: 4 x 4, camera to world, optical axes (x right, y down, z forward), metres.
+        depth: H x W, predicted, right up to the stream's scale.
+        valid: H x W bool, where there is a prediction.
+    """
+
+    image: np.ndarray
+    stamp: float
+    camera_matrix: np.ndarray
+    pose: np.ndarray
+    depth: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True)
+class MotionScaleState:
+    """All that is remembered between two frames; a value.
+
+    Attributes:
+        motion: tracks and views.
+        memory: points of the last seconds.
+        scale: None before the first measurement.
+        unit: log(metres / unit) of the relative output, locked at the first measurement.
+        contradicted: share of recent frames in which the odometry contradicts the pictures; half
+            at the start, as nothing is known of it.
+        stamp: of the last frame, seconds.
+    """
+
+    motion: MotionState = field(default_factory=MotionState)
+    memory: PointMemory = field(default_factory=PointMemory)
+    scale: FilterState | None = None
+    unit: float | None = None
+    contradicted: float = 0.5
+    stamp: float | None = None
+
+
+@dataclass(frozen=True)
+class MotionScale:
+    """What a frame's depth is to be multiplied with.
+
+    A frame whose odometry contradicts the pictures has no points of its own; those remembered
+    from the seconds before still count.
+
+    Attributes:
+        log_scale: of the frame in the locked unit; 0 before and at the first measurement.
+        field: H x W float32, to be added to log_scale.
+        metric: metres in the locked unit; None before the first measurement, and while the
+            odometry has agreed with too few of the recent pictures.
+        sigma: standard deviation of the frame's log scale in metres; NaN before the first
+            measurement.
+        points: that this frame rests on, remembered ones among them.
+        measured: the measurement of this frame, None without one.
+        problem: what is wrong with the odometry; empty when nothing is.
+    """
+
+    log_scale: float
+    field: np.ndarray
+    metric: float | None
+    sigma: float
+    points: MotionPoints
+    measured: ScaleMeasurement | None
+    problem: str
+
+    def relative(self, depth: np.ndarray) -> np.ndarray:
+        """H x W float32: predicted depth in the locked unit."""
+        factor = np.exp(self.field + np.float32(self.log_scale))
+        return np.asarray(depth * factor, np.float32)
+
+    def metres(self, depth: np.ndarray) -> np.ndarray | None:
+        """H x W float32: predicted depth in metres; None while `metric` is."""
+        return None if self.metric is None else self.relative(depth) * np.float32(self.metric)
+
+
+def step(
+    state: MotionScaleState, frame: MotionFrame, options: MotionScaleOptions
+) -> tuple[MotionScaleState, MotionScale]:
+    """Take the next frame of a stream.
+
+    Args:
+        state: after the frame before, MotionScaleState() for the first; it is not changed.
+        frame: the next one.
+        options: the same for all frames of a stream.
+
+    Returns:
+        The state after this frame, and its scale.
+
+    Raises:
+        ValueError: arrays of the frame do not fit together, the camera matrix is no pinhole
+            camera's, the pose is not 4 x 4, or the stamp is not finite.
+    """
+    _check(frame)
+    motion, points = observe(
+        state.motion, frame.image, frame.camera_matrix, frame.pose, options.motion
+    )
+    state = replace(_doubted(state, points, frame.stamp, options), motion=motion)
+    state, points = _remembered(state, points, frame, options)
+    ratios = log_ratios(points, frame.depth, frame.valid)
+    measured = measure_scale(points, ratios, frame.depth.shape, options.motion)
+    scale = _filtered(state.scale, measured, frame.stamp, options.scale)
+    unit = scale.log_scale if state.unit is None and scale is not None else state.unit
+    state = replace(state, scale=scale, unit=unit)
+    if scale is None or unit is None:
+        nothing = np.zeros(frame.depth.shape, np.float32)
+        return state, MotionScale(0.0, nothing, None, math.nan, points, None, points.problem)
+    found = MotionScale(
+        log_scale=scale.log_scale - unit,
+        field=_field(points, ratios - scale.log_scale, frame, options),
+        metric=math.exp(unit) if state.contradicted <= options.doubt else None,
+        sigma=scale.sigma,
+        points=points,
+        measured=measured,
+        problem=points.problem or _doubt_problem(state, options),
+    )
+    return state, found
+
+
+def _check(frame: MotionFrame) -> None:
+    size = frame.image.shape[:2]
+    if frame.image.shape != (*size, 3) or frame.image.dtype != np.uint8:
+        raise ValueError(
+            f"image must be H x W x 3 uint8, got {frame.image.shape} {frame.image.dtype}"
+        )
+    for name, array in (("depth", frame.depth), ("valid", frame.valid)):
+        if array.shape != size:
+            raise ValueError(f"{name} must have the image's size {size}, got {array.shape}")
+    if not math.isfinite(frame.stamp):
+        raise ValueError(f"stamp must be finite, got {frame.stamp}")
+
+
+def _doubted(
+    state: MotionScaleState, points: MotionPoints, stamp: float, options: MotionScaleOptions
+) -> MotionScaleState:
+    """How often the odometry contradicts the pictures; frames that cannot tell do not count."""
+    share = state.contradicted
+    if state.stamp is not None and math.isfinite(points.rms):
+        keep = math.exp(-max(stamp - state.stamp, 0.0) / options.doubt_seconds)
+        share = keep * share + (1 - keep) * bool(points.problem)
+    return replace(state, contradicted=share, stamp=stamp)
+
+
+def _doubt_problem(state: MotionScaleState, options: MotionScaleOptions) -> str:
+    if state.contradicted <= options.doubt:
+        return ""
+    agreed, needed = (f"{100 * (1 - share):.0f}%" for share in (state.contradicted, options.doubt))
+    return f"agrees with the pictures in {agreed} of the last frames, {needed} needed: no metres"
+
+
+def _remembered(
+    state: MotionScaleState, points: MotionPoints, frame: MotionFrame, options: MotionScaleOptions
+) -> tuple[MotionScaleState, MotionPoints]:
+    """The frame's points with the remembered ones, which tide over a few contradicted frames."""
+    if not state.motion.posed:
+        return state, points
+    if points.rms > options.motion.lost_rms:
+        return replace(state, memory=PointMemory()), points
+    camera, pose, stamp = frame.camera_matrix, frame.pose, frame.stamp
+    size = (frame.depth.shape[0], frame.depth.shape[1])
+    memory = remember(state.memory, points, camera, pose, stamp, options.memory)
+    points = recall(state.memory, points, camera, pose, stamp, size, options.memory)
+    return replace(state, memory=memory), points
+
+
+def _filtered(
+    state: FilterState | None,
+    measured: ScaleMeasurement | None,
+    stamp: float,
+    options: FilterOptions,
+) -> FilterState | None:
+    if measured is not None:
+        return update(state, stamp, measured.log_scale, measured.variance, options)
+    return None if state is None else predict(state, stamp, options)
+
+
+def _field(
+    points: MotionPoints, residuals: np.ndarray, frame: MotionFrame, options: MotionScaleOptions
+) -> np.ndarray:
+    """H x W float32; 0 where the field is switched off or has too few points."""
+    good = np.isfinite(residuals) & (points.sigma < options.field_sigma)
+    good &= points.sigma_pixels < options.field_sigma_pixels
+    if options.field is None or good.sum() < options.motion.fewest:
+        return np.zeros(frame.depth.shape, np.float32)
+    noise = np.hypot(_DOUBT * points.sigma[good], _SHAPE)
+    depth = np.where(frame.valid, frame.depth, np.nan)
+    return scale_field(points.pixels[good], residuals[good], noise, depth, options.field)

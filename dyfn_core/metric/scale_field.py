@@ -1,0 +1,121 @@
+"""A smooth field of log scale over the picture: what one scale leaves wrong in the shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+_DEPTH = 0.2  # weight of log depth beside the place in the picture
+_FAR = 3.0  # standard deviations beyond which a point loses weight
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """A Gaussian process over (x, y, log depth).
+
+    Attributes:
+        length: of its kernel, as a share of the picture's longer side.
+        deviation: its prior standard deviation.
+        most: points that it is conditioned on, the most certain ones.
+        step: pixels between the places where it is evaluated; it is interpolated in between.
+    """
+
+    length: float = 0.3
+    deviation: float = 0.18
+    most: int = 400
+    step: int = 8
+
+
+def scale_field(
+    pixels: np.ndarray,
+    residuals: np.ndarray,
+    noise: np.ndarray,
+    depth: np.ndarray,
+    options: FieldOptions,
+) -> np.ndarray:
+    """The field that explains the points' residual log ratios.
+
+    Args:
+        pixels: N x 2, (x, y).
+        residuals: N, log(measured / predicted) less the frame's log scale.
+        noise: N, standard deviations of the residuals.
+        depth: H x W predicted depth; not finite or <= 0 where there is no prediction.
+        options: see FieldOptions.
+
+    Returns:
+        H x W float32, to be added to log depth; 0 without points.
+    """
+    height, width = depth.shape
+    if not len(residuals):
+        return np.zeros((height, width), np.float32)
+    if len(residuals) > options.most:
+        best = np.sort(np.argsort(noise, kind="stable")[: options.most])
+        pixels, residuals, noise = pixels[best], residuals[best], noise[best]
+    rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
+    columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
+    logs = _log(depth[rows, columns])
+    middle = float(np.median(logs[np.isfinite(logs)])) if np.isfinite(logs).any() else 0.0
+    longest = max(height, width)
+    inside = _features(pixels / longest, logs, middle, options)
+    weights = _conditioned(inside, residuals, noise, options)
+    step = min(options.step, height, width)
+    y, x = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    coarse = _log(depth[grid[:, 1], grid[:, 0]])
+    outside = _features(grid / longest, coarse, middle, options)
+    single = np.float32  # enough here, and twice as fast
+    near = _kernel(outside.astype(single), inside.astype(single), options)
+    values = (near @ weights.astype(single)).reshape(len(y), len(x))
+    return _enlarged(values, (height, width), step)
+
+
+def _enlarged(values: np.ndarray, size: tuple[int, int], step: int) -> np.ndarray:
+    """Values at pixels step // 2, step // 2 + step, ... at every pixel."""
+    height, width = size
+    x = (np.arange(width, dtype=np.float32) - step // 2) / step
+    y = (np.arange(height, dtype=np.float32) - step // 2) / step
+    x, y = np.meshgrid(x.clip(0, values.shape[1] - 1), y.clip(0, values.shape[0] - 1))
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR))
+
+
+def _log(depth: np.ndarray) -> np.ndarray:
+    """Log depth, NaN without a prediction."""
+    known = np.isfinite(depth) & (depth > 0)
+    return np.where(known, np.log(np.where(known, depth, 1.0)), np.nan)
+
+
+def _features(
+    place: np.ndarray, logs: np.ndarray, middle: float, options: FieldOptions
+) -> np.ndarray:
+    """N x 3, in lengths of the kernel; `middle` stands for log depths that are unknown."""
+    logs = np.where(np.isfinite(logs), logs, middle)
+    return np.column_stack([place, _DEPTH * logs]) / options.length
+
+
+def _kernel(first: np.ndarray, second: np.ndarray, options: FieldOptions) -> np.ndarray:
+    """Covariance of the field between M and N places, M x N."""
+    found = first @ (-2 * second.T)
+    found += (first**2).sum(axis=1)[:, None]
+    found += (second**2).sum(axis=1)
+    np.maximum(found, 0, out=found)
+    found *= -0.5
+    np.exp(found, out=found)
+    found *= options.deviation**2
+    return np.asarray(found)
+
+
+def _conditioned(
+    inside: np.ndarray, residuals: np.ndarray, noise: np.ndarray, options: FieldOptions
+) -> np.ndarray:
+    """The weights of the points (N); outliers are held back by one reweighting."""
+    kernel = _kernel(inside, inside, options)
+    variance = noise**2
+    for _ in range(2):
+        factor = cho_factor(kernel + np.diag(variance), lower=True, check_finite=False)
+        weights: np.ndarray = cho_solve(factor, residuals, check_finite=False)
+        misfit = np.abs(residuals - kernel @ weights)
+        variance = noise**2 * np.maximum(1.0, misfit / (_FAR * noise)) ** 2
+    return weights
