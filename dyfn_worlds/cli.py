@@ -11,6 +11,8 @@ from typing import NoReturn
 
 from tqdm import tqdm
 
+from dyfn_worlds.camera.cameras import PLACEMENTS, USUAL
+from dyfn_worlds.camera.paths import PACES
 from dyfn_worlds.generate import MapWorlds, RoomWorlds, ShardJob, render
 
 UNUSABLE, INTERRUPTED = 2, 130
@@ -74,6 +76,14 @@ def parser() -> argparse.ArgumentParser:
         default="maps",
         help="maps: Quake levels; rooms: furnished rooms (default: maps)",
     )
+    add(
+        "--placement",
+        choices=PLACEMENTS,
+        default=USUAL,
+        help="where the camera of a view stands: close before a thing, steeply above it, low on the "
+        f"floor, or high above (default: {USUAL})",
+    )
+    add("--pace", choices=tuple(PACES), help="how the camera of a clip moves (default: drawn)")
     add("--seed", type=_count, default=0, metavar="N", help="seed of the first shard (default: 0)")
     add = parser.add_argument_group("output").add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="folder of shards to add to")
@@ -111,7 +121,12 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """-> exit code."""
-    options = parser().parse_args(argv)
+    reader = parser()
+    options = reader.parse_args(argv)
+    if options.pace and not options.clip_frames:
+        reader.error("--pace is that of clips, and --clip-frames is 0")
+    if options.placement != USUAL and options.clip_frames:
+        reader.error("--placement is that of views, and --clip-frames asks for clips")
     try:
         _render(options)
     except (OSError, ValueError, ImportError) as error:
@@ -132,6 +147,8 @@ def _render(options: argparse.Namespace) -> None:
         options.seed,
         options.size,
         options.clip_fps,
+        options.placement,
+        options.pace,
     )
     if not options.assets.is_dir():
         raise NotADirectoryError(f"--assets {options.assets}: no such folder")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dyfn_worlds.camera.cameras import USUAL
 from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.casting import Cast
 from dyfn_worlds.maps.quake import GameFiles, MapError, load_map
@@ -31,7 +32,8 @@ class ShardJob:
     """How much of one kind of world to render, and how.
 
     clip_frames: length of a clip; 0 renders independent views, `views` of them for each shard.
-    clip_fps: frames in a second of the walk; low is far from frame to frame.
+    clip_fps: frames in a second of the walk; low is far from frame to frame. placement: of
+    independent views, one of cameras.PLACEMENTS. pace: of clips, one of paths.PACES; None draws it.
     """
 
     worlds: str
@@ -41,6 +43,8 @@ class ShardJob:
     seed: int
     size: tuple[int, int]
     clip_fps: float = 5.0
+    placement: str = USUAL
+    pace: str | None = None
 
 
 class MapWorlds:
@@ -104,7 +108,7 @@ def render(
         rng = np.random.default_rng([zlib.crc32(job.worlds.encode()), bool(job.clip_frames), seed])
         try:
             scene = worlds.scene(rng, held_out)
-            photographer = Photographer(renderer, scene, rng)
+            photographer = Photographer(renderer, scene, rng, job.placement, job.pace)
             if job.clip_frames:
                 views = photographer.clip(job.clip_frames, job.clip_frames / job.clip_fps)
             else:

@@ -14,6 +14,8 @@ from dyfn_worlds.scene.scene import Scene
 FAR = 200.0
 CLEARANCE = 0.3
 PROBES = 32
+USUAL = "usual"
+PLACEMENTS = (USUAL, "close", "steep", "low", "above")
 LENSES = ((38.0, 62.0), (55.0, 82.0), (80.0, 118.0))  # degrees across
 
 
@@ -56,7 +58,9 @@ class FreeSpace:
         result: np.ndarray = self.distance(start, unit) >= length
         return result
 
-    def sample_point(self, rng: np.random.Generator, heights: tuple[float, float]) -> np.ndarray:
+    def sample_point(
+        self, rng: np.random.Generator, heights: tuple[float, float], clear: float = CLEARANCE
+    ) -> np.ndarray:
         """A point in free space, heights[0]..heights[1] metres above what lies below it."""
         for _ in range(200):
             start = self.viewpoints[rng.integers(len(self.viewpoints))] + [0, 0, 0.3]
@@ -69,7 +73,7 @@ class FreeSpace:
                 continue
             lifted: np.ndarray = point + np.array([0, 0, rng.uniform(*heights) - floor])
             free = self.sees(point[None], lifted[None])[0]
-            if free and self.clearance(lifted[None])[0] > CLEARANCE:
+            if free and self.clearance(lifted[None])[0] > clear:
                 return lifted
         raise ValueError("no free camera position found: is the scene closed or empty?")
 
@@ -135,6 +139,85 @@ def random_view(
     pitch = np.radians(np.clip(rng.normal(-10, 13), -65, 35))
     roll = np.radians(rng.normal(0, 4))
     return RenderCamera(pose_at(position, rng.uniform(0, 2 * np.pi), pitch, roll), lens.focal)
+
+
+def placed_view(
+    space: FreeSpace,
+    rng: np.random.Generator,
+    lens: CameraLens,
+    interests: np.ndarray,
+    placement: str = USUAL,
+) -> RenderCamera:
+    """One camera of one of PLACEMENTS. Raises ValueError when none is found.
+
+    usual: see random_view. close: 0.3 to 1 m before a point of interest, the room behind it.
+    steep: 0.5 to 2.2 m above a point of interest or the floor, 35 to 90 degrees down. low: at a
+    wheeled robot's height. above: 2 to 10 m over the ground, 20 to 90 degrees down.
+    """
+    if placement == "close" and len(interests):
+        for _ in range(6):
+            camera = _view_close(space, rng, lens, interests[rng.integers(len(interests))])
+            if camera is not None:
+                return camera
+    if placement == "steep" and len(interests) and rng.random() < 0.7:
+        for _ in range(4):
+            camera = _view_down(space, rng, lens, interests[rng.integers(len(interests))])
+            if camera is not None:
+                return camera
+    if placement in (USUAL, "close"):
+        return random_view(space, rng, lens, interests)
+    heights = {"steep": (0.6, 2.2), "low": (0.15, 0.5), "above": (2.0, 10.0)}[placement]
+    narrow = CLEARANCE / 2 if placement == "low" else CLEARANCE
+    position = space.sample_point(rng, heights, narrow)
+    if placement == "low":
+        pitch = rng.normal(-3, 8)
+    else:
+        pitch = rng.uniform(-90, -35 if placement == "steep" else -20)
+    roll = np.radians(rng.normal(0, 4))
+    yaw = rng.uniform(0, 2 * np.pi)
+    return RenderCamera(pose_at(position, yaw, np.radians(pitch), roll), lens.focal)
+
+
+def _view_close(
+    space: FreeSpace, rng: np.random.Generator, lens: CameraLens, target: np.ndarray
+) -> RenderCamera | None:
+    """A camera 0.3 to 1 m from a point, as somebody sits before it or an arm reaches for it."""
+    for _ in range(10):
+        reach, around = rng.uniform(0.3, 1.0), rng.uniform(0, 2 * np.pi)
+        rise = rng.uniform(0.05, 0.7)
+        offset = np.array([reach * np.cos(around), reach * np.sin(around), rise])
+        position = target + offset
+        if not space.sees(position[None], (target + np.array([0, 0, 0.12]))[None])[0]:
+            continue
+        if space.clearance(position[None])[0] < 0.5 * CLEARANCE:
+            continue
+        yaw = around + np.pi + rng.normal(0, 0.3)
+        pitch = np.clip(
+            rng.uniform(-1.0, 0.1) * np.arctan2(rise, reach) + rng.normal(0, 0.2), -1.2, 0.4
+        )
+        roll = np.radians(rng.normal(0, 4))
+        return RenderCamera(pose_at(position, yaw, float(pitch), roll), lens.focal)
+    return None
+
+
+def _view_down(
+    space: FreeSpace, rng: np.random.Generator, lens: CameraLens, target: np.ndarray
+) -> RenderCamera | None:
+    """A camera above a point that looks at it 35 to 90 degrees down."""
+    for _ in range(10):
+        reach, slope = rng.uniform(0.45, 1.8), np.radians(rng.uniform(35, 90))
+        around = rng.uniform(0, 2 * np.pi)
+        flat = reach * np.cos(slope)
+        offset = np.array([flat * np.cos(around), flat * np.sin(around), reach * np.sin(slope)])
+        position = target + offset
+        if space.clearance(position[None])[0] < 0.5 * CLEARANCE:
+            continue
+        if not space.sees(position[None], (target + np.array([0, 0, 0.12]))[None])[0]:
+            continue
+        yaw = around + np.pi + rng.normal(0, 0.15)
+        pitch = float(np.clip(-slope + rng.normal(0, 0.12), -np.pi / 2, -0.5))
+        return RenderCamera(pose_at(position, yaw, pitch, np.radians(rng.normal(0, 6))), lens.focal)
+    return None
 
 
 def _view_past(

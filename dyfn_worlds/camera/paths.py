@@ -15,6 +15,8 @@ PACES = {
     "standing": ((0.0, 0.12), (0.3, 1.3), 0.2),
     "walking": ((0.3, 1.2), (0.3, 1.2), 0.55),
     "hurried": ((0.8, 1.8), (0.8, 2.2), 0.25),
+    "static": ((0.0, 0.0), (0.0, 0.0), 0.0),
+    "turning": ((0.0, 0.05), (0.8, 2.2), 0.0),
 }
 
 
@@ -55,14 +57,17 @@ def random_path(
     lens: CameraLens,
     seconds: float,
     interests: np.ndarray | None = None,
+    pace: str | None = None,
 ) -> CameraPath:
     """A camera that walks for `seconds`: a spline between free points, looking about.
 
-    interests: N x 3 points of which one is kept in view by some paths.
+    interests: N x 3 points of which one is kept in view by some paths. pace: one of PACES; None
+    draws one by their shares.
     Raises ValueError when no collision-free path is found.
     """
     shares = [share for _, _, share in PACES.values()]
-    pace = str(rng.choice(list(PACES), p=shares))
+    drawn = str(rng.choice(list(PACES), p=shares))
+    pace = pace or drawn
     speeds, turns, _ = PACES[pace]
     jitter = float(rng.choice([0.0, 1.0])) * float(rng.lognormal(np.log(0.25), 0.7))
     count = max(int(np.ceil(seconds * RATE)) + 1, 3)
@@ -71,6 +76,10 @@ def random_path(
         if points is None:
             continue
         positions = _spline(points, count)
+        if pace in ("static", "turning"):
+            positions = np.repeat(positions[:1], count, axis=0)
+        if pace == "static":
+            jitter = 0.0
         if jitter:
             positions = positions + _shake(rng, count, seconds, jitter * 0.008)
         looked = positions[:: int(RATE / 6)]
@@ -151,6 +160,7 @@ def _look_about(
     """count x 3 yaw, pitch, roll: along the way, at a point, or freely, with slow turns."""
     count = len(positions)
     knots = max(2, int(seconds / 1.5))
+    sway = 1.0 if turning > 0 else 0.0
     pitch = np.full(count, np.radians(rng.normal(-13, 8)))
     if interests is not None and len(interests) and rng.random() < 0.45:
         near = np.linalg.norm(interests - positions[count // 2], axis=1)
@@ -167,7 +177,7 @@ def _look_about(
         follow = rng.choice([0.0, 0.5, 1.0])
         yaw = rng.uniform(0, 2 * np.pi) * (1 - follow) + follow * along
     yaw = yaw + _smooth_noise(rng, count, knots) * turning
-    pitch = pitch + _smooth_noise(rng, count, knots) * np.radians(11)
+    pitch = pitch + _smooth_noise(rng, count, knots) * np.radians(11) * sway
     pitch = np.clip(pitch, np.radians(-65), np.radians(35))
-    roll = _smooth_noise(rng, count, knots) * np.radians(3)
+    roll = _smooth_noise(rng, count, knots) * np.radians(3) * sway
     return np.stack([yaw, pitch, roll], axis=1)

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import CameraLens, FreeSpace, random_view
+from dyfn_worlds.camera.cameras import USUAL, CameraLens, FreeSpace, placed_view
 from dyfn_worlds.camera.paths import CameraPath, random_path
 from dyfn_worlds.camera.staging import LightScript, stage, stand
 from dyfn_worlds.render.occlusion import shade_corners
@@ -62,7 +62,15 @@ def _always(moment: Moment, seconds: float) -> Moment:
 class Photographer:
     """Looks before it shoots: exposure from a small probe, and views not worth keeping refused."""
 
-    def __init__(self, renderer: Renderer, scene: Scene, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        renderer: Renderer,
+        scene: Scene,
+        rng: np.random.Generator,
+        placement: str = USUAL,
+        pace: str | None = None,
+    ) -> None:
+        self.placement, self.pace = placement, pace
         self.renderer, self.scene, self.rng = renderer, scene, rng
         self.space = FreeSpace(scene)
         self.style = Style.sample(rng)
@@ -75,8 +83,9 @@ class Photographer:
         solid = np.isfinite(depth)
         if solid.mean() < 0.5 or np.quantile(depth, 0.02) < 0.2:
             return None
+        plain = 0.4 if self.placement in ("steep", "close", "above") else 0.85
         low, middle, high = np.quantile(depth[solid], [0.05, 0.5, 0.95])
-        if middle > 25 or (high < 1.7 * low and self.rng.random() < 0.85):
+        if middle > 25 or (high < 1.7 * low and self.rng.random() < plain):
             return None
         mean = max(float(image[solid].mean()), 2.0)
         contrast = image[solid].std() / mean
@@ -91,7 +100,7 @@ class Photographer:
             if len(views) == count:
                 break
             lens = CameraLens.sample(self.rng, self.renderer.size)
-            camera = random_view(self.space, self.rng, lens, self.scene.interests)
+            camera = placed_view(self.space, self.rng, lens, self.scene.interests, self.placement)
             moment = Moment(self._extras(camera), self._lamps(), float(self.rng.uniform(0.6, 1.3)))
             exposure = self.exposure(camera, moment)
             if exposure is None:
@@ -108,7 +117,7 @@ class Photographer:
         """
         for _ in range(8):
             lens = CameraLens.sample(self.rng, self.renderer.size)
-            path = random_path(self.space, self.rng, lens, seconds, self.scene.interests)
+            path = random_path(self.space, self.rng, lens, seconds, self.scene.interests, self.pace)
             times = (np.arange(count) + 0.5) * seconds / count
             probes = [self.exposure(path.at(t)) for t in times[:: max(1, count // 16)]]
             good = [e for e in probes if e is not None]
