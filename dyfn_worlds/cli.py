@@ -80,8 +80,8 @@ def parser() -> argparse.ArgumentParser:
         "--placement",
         choices=PLACEMENTS,
         default=USUAL,
-        help="where the camera of a view stands: close before a thing, steeply above it, low on the "
-        f"floor, or high above (default: {USUAL})",
+        help="where the camera of a view stands: close before a thing, steeply above it, low over "
+        f"the floor, or high above (default: {USUAL})",
     )
     add("--pace", choices=tuple(PACES), help="how the camera of a clip moves (default: drawn)")
     add("--seed", type=_count, default=0, metavar="N", help="seed of the first shard (default: 0)")
