@@ -73,6 +73,11 @@ NONSENSE = [
     (" ".join(["dyfn-worlds", *WORLDS, "--size", "0x10"]), "HEIGHTxWIDTH such as 240x320"),
     (" ".join(["dyfn-worlds", *WORLDS, "--shards", "-1"]), "--shards"),
     (" ".join(["dyfn-worlds", *WORLDS, "--clip-fps", "0"]), "--clip-fps"),
+    (" ".join(["dyfn-worlds", *WORLDS, "--pace", "static"]), "--pace is that of clips"),
+    (
+        " ".join(["dyfn-worlds", *WORLDS, "--clip-frames", "8", "--placement", "low"]),
+        "--placement is that of views",
+    ),
 ]
 
 
