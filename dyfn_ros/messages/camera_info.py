@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +16,7 @@ class CameraCalibration:
     """What a CameraInfo says about one image.
 
     matrix: 3 x 3 float64, pixels of the image at hand (binning and region of interest applied).
-    model: name of the lens model. d: its coefficients; empty for rectified images.
+    model: name of the lens model, see lens_model. d: its coefficients; empty for rectified images.
     """
 
     matrix: np.ndarray
@@ -65,7 +66,23 @@ def decode_camera_info(
     matrix[0, :2] /= bin_x
     matrix[1, 1] /= bin_y
     d = () if rectified else tuple(float(value) for value in _field(info, "d"))
-    return CameraCalibration(matrix, str(info.distortion_model), d)
+    return CameraCalibration(matrix, lens_model(str(info.distortion_model)), d)
+
+
+# Other names of models that ROS knows; compared in lower case, words joined by _.
+_MODELS = {
+    "radtan": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant",
+    "equi": "equidistant",
+    "fisheye": "equidistant",
+}
+
+
+def lens_model(name: str) -> str:
+    """The name that ROS has for a lens model; unknown names stay."""
+    return _MODELS.get(re.sub(r"[\s/-]+", "_", name.strip().lower()), name)
 
 
 def _field(info: Any, name: str) -> Any:

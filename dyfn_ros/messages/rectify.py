@@ -13,6 +13,10 @@ from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.images import MessageError
 
 
+class LensError(MessageError):
+    """A lens model that cannot be undone."""
+
+
 @dataclass(frozen=True)
 class PinholeImage:
     """An image as a pinhole camera sees it.
@@ -111,7 +115,8 @@ def undistort_depth(depth: np.ndarray, view: PinholeImage) -> np.ndarray:
 
 
 def _check_frame_id(image: str, info: str) -> None:
-    if image and info and image != info:
+    # tf1 wrote names with a slash in front.
+    if image and info and image.lstrip("/") != info.lstrip("/"):
         raise MessageError(f"frame_id is {info!r}, but the images have {image!r}")
 
 
@@ -121,18 +126,18 @@ def undistortion(
     """Maps to the pinhole image with the same K: two H x W float32 (columns and rows of the
     source pixels), and H x W bool where those are inside the image.
 
-    Raises MessageError for an unknown lens model.
+    Raises LensError for an unknown lens model.
     """
     matrix, d = calibration.matrix, np.asarray(calibration.d, np.float64)
     size = (width, height)
     if calibration.model in ("plumb_bob", "rational_polynomial") and d.size in (4, 5, 8, 12, 14):
         maps = cv2.initUndistortRectifyMap(matrix, d, np.eye(3), matrix, size, cv2.CV_32FC1)
-    elif calibration.model in ("equidistant", "fisheye") and d.size == 4:
+    elif calibration.model == "equidistant" and d.size == 4:
         maps = cv2.fisheye.initUndistortRectifyMap(matrix, d, np.eye(3), matrix, size, cv2.CV_32FC1)
     else:
-        raise MessageError(
+        raise LensError(
             f"the lens model {calibration.model!r} with {d.size} coefficients cannot be undone; "
-            "known: plumb_bob, rational_polynomial, equidistant"
+            "known: plumb_bob (radtan), rational_polynomial, equidistant (kannala_brandt, fisheye)"
         )
     columns, rows = maps
     inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)

@@ -103,7 +103,7 @@ class GroundTruth:
 
     def _check_place(self, message: Any, frame_id: str, assumed: str) -> None:
         own = str(message.header.frame_id)
-        if self._transform is None and own != frame_id:
+        if self._transform is None and own.lstrip("/") != frame_id.lstrip("/"):
             self._warn(f"frame {own!r} taken to be {assumed} ({frame_id!r}): no transform given")
 
 

@@ -13,7 +13,7 @@ from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_image
-from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
+from dyfn_ros.messages.rectify import LensError, PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
 from dyfn_ros.recordings.depth_matching import Match, Stamped, match_depth
 from dyfn_ros.recordings.errors import RecordingError
@@ -145,7 +145,9 @@ class BagRecording:
             pixels = decode_compressed(message) if compressed else decode_image(message)
             view = calibrator.view(pixels, frame_id, infos.message(), self._rules)
         except MessageError as error:
-            self.notes.losses[f"{image.recorded.topic}: image skipped: {error}"] += 1
+            way = "; --camera-info-topic none takes the images as they are"
+            text = f"{error}{way if isinstance(error, LensError) else ''}"
+            self.notes.losses[f"{image.recorded.topic}: image skipped: {text}"] += 1
             return None
         return RecordedFrame(
             index=index,
