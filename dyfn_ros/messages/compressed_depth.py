@@ -11,6 +11,7 @@ import numpy as np
 from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.messages.picture_size import PNG, check_picture_size
+from dyfn_ros.messages.rvl import decode_rvl
 
 _HEADER = struct.Struct("<iff")  # compressedDepth: format, then A and B of z = A / (value - B)
 
@@ -27,8 +28,9 @@ def is_compressed_depth(message: Any) -> bool:
 def decode_compressed_depth(message: Any) -> np.ndarray:
     """CompressedImage with depth -> H x W float32 metres, NaN where there is none.
 
-    16-bit PNG in millimetres, plain or as compressedDepth; compressedDepth of 32FC1 is inverse
-    depth. Raises MessageError for anything else, naming the format, and for more than MAX_PIXELS.
+    16-bit PNG in millimetres, plain or as compressedDepth, which may be RVL as well;
+    compressedDepth of 32FC1 is inverse depth. Raises MessageError for anything else, naming the
+    format, and for more than MAX_PIXELS.
     """
     layout, data = str(message.format), bytes(message.data)
     inverse: tuple[float, float] | None = None
@@ -38,7 +40,10 @@ def decode_compressed_depth(message: Any) -> np.ndarray:
         _, a, b = _HEADER.unpack_from(data)
         data = data[_HEADER.size :]
         inverse = (a, b) if layout.startswith("32FC1") else None
-    values = _png16(layout, data)
+    if "compressedDepth" in layout and layout.lower().rstrip().endswith("rvl"):
+        values = _rvl(layout, data)
+    else:
+        values = _png16(layout, data)
     if inverse is None:
         metres = values.astype(np.float32) * np.float32(0.001)
     else:
@@ -76,6 +81,13 @@ def encode_compressed_depth(
     if not ok:
         raise MessageError(f"a depth image of {depth.shape} could not be compressed")
     return f"{encoding}; compressedDepth png", _HEADER.pack(0, a, b) + data.tobytes()
+
+
+def _rvl(layout: str, data: bytes) -> np.ndarray:
+    try:
+        return decode_rvl(data)
+    except MessageError as error:
+        raise MessageError(f"depth of format {layout!r}: {error}") from error
 
 
 def _png16(layout: str, data: bytes) -> np.ndarray:

@@ -84,7 +84,8 @@ def test_colour_is_not_depth() -> None:
     ("layout", "data", "reason"),
     [
         ("16UC1; compressedDepth png", b"\0" * 5, "ends early: 5 bytes"),
-        ("16UC1; compressedDepth rvl", b"\0" * 40, "expected a 16-bit PNG, found none"),
+        ("16UC1; compressedDepth png", b"\0" * 40, "expected a 16-bit PNG, found none"),
+        ("16UC1; compressedDepth rvl", b"\0" * 15, "the RVL image ends early: 3 bytes"),
         ("16UC1; png compressed", png(MILLIMETRES)[:-20], "ends early"),
     ],
 )
