@@ -71,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
         "--rate",
         type=finite_above_zero,
         metavar="X",
-        help="frames per second, for folders without stamps",
+        help="frames per second, for folders without stamps and videos without times",
     )
     add_stride(group)
     add_max_frames(group)
@@ -183,14 +183,14 @@ def _frames(options: RecordOptions, left_out: Counter[str]) -> Iterator[FrameToR
                 "registered to undistorted images, whose --intrinsics can be given"
             )
         return folder_frames(source, warn, options.rate, options.intrinsics, options.depth_scale)
-    if options.rate or options.depth_scale:
-        raise RecordingError(f"{source}: --rate and --depth-scale are for folders, not for a video")
+    if options.depth_scale:
+        raise RecordingError(f"{source}: --depth-scale is for folders, not for a video")
     if options.camera_info is not None and (options.intrinsics or options.distortion):
         raise RecordingError("give --camera-info, or --intrinsics and --distortion, not both")
     if options.distortion and not options.intrinsics:
         raise RecordingError("--distortion needs --intrinsics")
     camera = None if options.camera_info is None else read_camera_yaml(options.camera_info)
-    return video_frames(source, warn, _matrix(options), _lens(options), camera)
+    return video_frames(source, warn, _matrix(options), _lens(options), camera, options.rate)
 
 
 def _matrix(options: RecordOptions) -> np.ndarray | None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
+from urllib.parse import quote
 
 import apsw
 import cv2
 import numpy as np
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from dyfn_core.files import OutputError, cannot_write
 from dyfn_ros.recordings.errors import RecordingError
@@ -35,6 +39,20 @@ from dyfn_ros.recordings.typestore import (
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
 DepthEncoding = Literal["png", "16UC1", "32FC1"]
+
+
+class _SqliteStorage(Sqlite3Writer):
+    """rosbags puts the path into an address as it is, where # ? and % mean something."""
+
+    def __init__(self, path: Path, compression: CompressionMode) -> None:
+        super().__init__(Path(quote(os.fsencode(path))), compression)
+        self.path = path / f"{path.name}.db3"
+
+
+class _Writer(Writer):
+    STORAGE_PLUGINS = MappingProxyType(
+        {**Writer.STORAGE_PLUGINS, StoragePlugin.SQLITE3: _SqliteStorage}
+    )
 
 
 class RecordingWriter:
@@ -64,12 +82,16 @@ class RecordingWriter:
 
     def _open(self) -> Writer:
         shutil.rmtree(self._partial, ignore_errors=True)
-        writer = Writer(
+        writer = _Writer(
             self._partial / self.path.stem, version=9, storage_plugin=STORAGES[self._storage]
         )
         if self._storage == "mcap":
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        writer.open()
+        try:
+            writer.open()
+        except WRITE_ERRORS as error:
+            shutil.rmtree(self._partial, ignore_errors=True)
+            raise _full(self.path, error) from error
         return writer
 
     def __enter__(self) -> RecordingWriter:

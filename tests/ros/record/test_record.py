@@ -143,6 +143,92 @@ def film(path: Path, times: list[float]) -> Path:
     return path
 
 
+def raw_stream(path: Path, codec: str, container: str) -> Path:
+    """Ten frames, grey of 20 x their index, without times."""
+    with av.open(str(path), "w", format=container) as file:
+        stream = file.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for index in range(10):
+            image = np.full((96, 128, 3), 20 * index, np.uint8)
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        file.mux(stream.encode())
+    return path
+
+
+RAW_STREAMS = [("v.h264", "libx264", "h264"), ("v.265", "libx265", "hevc")]
+
+
+@pytest.mark.parametrize(("name", "codec", "container"), RAW_STREAMS)
+def test_a_video_without_times_needs_a_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, codec: str, container: str
+) -> None:
+    video = raw_stream(tmp_path / name, codec, container)
+    assert wrong(tmp_path, video) == UNUSABLE
+    assert "holds no times of its 10 frames" in (error := capsys.readouterr().err)
+    assert "give --rate" in error
+    assert not [path for path in tmp_path.iterdir() if path != video]
+    frames = made(video, tmp_path / "walk.mcap", "--colour", "raw", "--rate", "20")
+    assert [f.stamp_ns for f in frames] == [index * 50_000_000 for index in range(10)]
+    assert [f.image.mean() for f in frames] == pytest.approx([20 * i for i in range(10)], abs=3)
+
+
+@pytest.mark.parametrize("position", [1, 3, 9])
+def test_one_repeated_time_costs_one_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], position: int
+) -> None:
+    times = [*range(10)]
+    times[position:] = [time - 1 for time in times[position:]]
+    path, base = tmp_path / "v.mkv", Fraction(1, 1000)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        stream.codec_context.time_base = base
+        for index, time in enumerate(times):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 20 * index, np.uint8))
+            frame.pts, frame.time_base = 100 * time, base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    assert wrong(tmp_path, path, "--colour", "raw") == PARTIAL
+    said = f"1 frames whose time does not rise are left out (frame {position} at "
+    assert said in capsys.readouterr().err
+    frames = list(open_recording(tmp_path / "out").frames())
+    assert [f.stamp_ns for f in frames] == [index * 100_000_000 for index in range(9)]
+    shades = [20 * index for index in range(10) if index != position]
+    assert [f.image.mean() for f in frames] == pytest.approx(shades, abs=2)
+
+
+ODD_NAMES = ["walk #1", "walk #1.db3", "walk?.db3", "50%41", "a&b=c", "ünü.db3", "w%20.mcap"]
+
+
+@pytest.mark.parametrize("name", ODD_NAMES)
+@pytest.mark.parametrize("parent", [".", "data #2?%41"])
+def test_names_that_mean_something_in_an_address(tmp_path: Path, name: str, parent: str) -> None:
+    plain(tmp_path / "source")
+    folder = tmp_path / "made" / parent
+    folder.mkdir(parents=True)
+    storage = [] if name.endswith((".db3", ".mcap")) else ["--storage", "sqlite3"]
+    frames = made(tmp_path / "source", folder / name, "--colour", "png", *storage)
+    assert len(frames) == 3
+    np.testing.assert_array_equal(frames[2].image, picture(2))
+    assert [*folder.iterdir()] == [folder / name]
+    if storage:
+        assert {f.name for f in (folder / name).iterdir()} == {"metadata.yaml", f"{name}.db3"}
+    assert len([path for path in (tmp_path / "made").rglob("*") if path.is_file()]) == (
+        2 if storage else 1
+    )
+
+
+def test_a_place_that_cannot_be_written_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain(tmp_path / "source")
+    (tmp_path / "file").write_text("no folder")
+    out = tmp_path / "file" / "walk.db3"
+    assert main([str(tmp_path / "source"), "--out", str(out)]) == UNUSABLE
+    assert f"{out}" in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "source"]
+
+
 CALIBRATION = {
     "image_width": 64,
     "image_height": 48,
