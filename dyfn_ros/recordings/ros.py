@@ -20,7 +20,7 @@ from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.ground_truth import GroundTruth
 from dyfn_ros.recordings.storage.base import Recorded, Storage
-from dyfn_ros.recordings.topics import Topics
+from dyfn_ros.recordings.topics import Topics, topic_remarks
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 
 
@@ -56,7 +56,8 @@ class BagRecording:
     def frames(self) -> Iterator[RecordedFrame]:
         """See Recording."""
         self.notes = Notes()
-        self.notes.warnings.update((*self.topics.remarks, *self._storage.remarks))
+        self.notes.warnings.update(topic_remarks(self._storage, self.topics))
+        self.notes.warnings.update(self._storage.remarks)
         infos = _Infos(self._first(self.topics.camera_info), self._unusable)
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
         calibrator = Rectifier(self._unusable)

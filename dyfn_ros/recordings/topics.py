@@ -33,14 +33,12 @@ class Topics:
     """image: colour, raw or compressed. camera_info, depth, depth_info: None to do without.
 
     depth: images or clouds; depth_info: the CameraInfo of depth images that have their own.
-    remarks: what is recorded and not used although it might be expected to be.
     """
 
     image: str
     camera_info: str | None
     depth: str | None
     depth_info: str | None = None
-    remarks: tuple[str, ...] = ()
 
 
 def choose_topics(
@@ -83,8 +81,12 @@ def choose_topics(
         camera_info=info,
         depth=truth,
         depth_info=_optional(path, kinds, depth_info, {CAMERA_INFO}, own),
-        remarks=(*_fuller_twins(storage, [chosen, truth]), *_empty(storage)),
     )
+
+
+def topic_remarks(storage: Storage, topics: Topics) -> list[str]:
+    """What is recorded, or should be, and is not used although that might be expected."""
+    return [*_fuller_twins(storage, [topics.image, topics.depth]), *_empty(storage)]
 
 
 def _no_image(path: Path, storage: Storage, kinds: dict[str, str]) -> RecordingError:
