@@ -4,8 +4,8 @@
         --images data/rooms_usual data/real/train
 
 The recurrence sees every channel of the latent less its usual mean, over its usual deviation: both
-are moved as the latents of the same pictures moved from the old base to the new one. Nothing is
-trained.
+are moved as the latents of the same pictures moved from the old base to the new one. Its
+corrections are multiplied by --gain; --half stores float16. Nothing is trained.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--images", type=Path, nargs="+", required=True, help="roots of *.jpg")
     parser.add_argument("--count", type=int, default=100, help="pictures, as many of each root")
+    parser.add_argument("--gain", type=float, default=1.0, help="of DyFN's corrections")
+    parser.add_argument("--half", action="store_true", help="store float16")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -65,7 +67,11 @@ def main() -> None:
     print(f"deviations by a factor of {ratio.log().abs().mean().exp():.2f}, on average")
     mean.copy_(moved.to(mean.dtype))
     std.copy_((std.double() * ratio).to(std.dtype))
-    save_model(new, options.out)
+    for head in (new.stabilizer.gamma_head, new.stabilizer.beta_head):
+        assert isinstance(head, torch.nn.Conv2d) and head.bias is not None
+        head.weight.data.mul_(options.gain)
+        head.bias.data.mul_(options.gain)
+    save_model(new, options.out, torch.float16 if options.half else None)
 
 
 if __name__ == "__main__":

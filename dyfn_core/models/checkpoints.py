@@ -40,7 +40,11 @@ MODEL_TYPES: dict[str, type[GeometryModel]] = {
     "mini": MiniModel,
     "moge": MoGeModel,
 }
-BUNDLED = {"dyfn-mini": "dyfn-mini.safetensors"}
+BUNDLED = {
+    "dyfn-mini": "dyfn-mini.safetensors",
+    "dyfn-mini-5": "dyfn-mini.safetensors",  # the default by its version
+    "dyfn-mini-6": "dyfn-mini-6.safetensors",
+}
 HUB_FILES = {
     "shawlyu/dyfn": "DyFN.pt",
     "depth-anything/depth-anything-v2-small": "depth_anything_v2_vits.pth",
