@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dyfn_core.models.base import GeometryModel
+from dyfn_core.models.base import GeometryModel, image_to_batch
 from dyfn_core.models.checkpoints import load_model, save_model
 
 
@@ -32,8 +32,8 @@ def statistics(model: GeometryModel, reader: GeometryModel, files: list[Path]) -
         image = cv2.imread(str(file))
         if image is None:
             raise FileNotFoundError(f"{file} is no image")
-        pixels = torch.from_numpy(np.ascontiguousarray(image[..., ::-1])).permute(2, 0, 1)[None]
-        features = model.encode(pixels.float() / 255).features
+        pixels, _ = image_to_batch(np.ascontiguousarray(image[..., ::-1]), model.device)
+        features = model.encode(pixels).features
         seen.append(stabilizer.gru_input(features, features.mean((-2, -1)))[0].flatten(1))
     channels = torch.cat(seen, 1).double()
     return [channels.mean(1), channels.std(1).clamp(min=1e-6)]

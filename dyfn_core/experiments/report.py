@@ -15,7 +15,7 @@ from dyfn_core.evaluation.report.html import format_cell
 from dyfn_core.evaluation.variants import BASE_ROWS, gap_closed
 from dyfn_core.experiments.declared import Experiment
 from dyfn_core.experiments.runner import ArmScores
-from dyfn_core.files import finished_file
+from dyfn_core.files import write_text
 from dyfn_core.scoring.variants import VariantScore
 
 HEADING = "## Experiments"
@@ -157,5 +157,4 @@ def write_section(path: Path, name: str, text: str) -> None:
         if HEADING not in content.splitlines():
             content = f"{content.rstrip()}\n\n{HEADING}\n".lstrip()
         content = f"{content.rstrip()}\n\n{block}\n"
-    with finished_file(path) as partial:
-        partial.write_text(content, encoding="utf-8")
+    write_text(path, content)

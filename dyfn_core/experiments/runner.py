@@ -22,7 +22,7 @@ from dyfn_core.evaluation.variants import (
     score_stabilizer,
 )
 from dyfn_core.experiments.declared import Arm
-from dyfn_core.files import finished_file
+from dyfn_core.files import write_text
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFNConfig
@@ -218,5 +218,4 @@ def _digest(config: DyFNRunConfig) -> str:
 
 def _write_json(path: Path, values: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with finished_file(path) as partial:
-        partial.write_text(json.dumps(values, indent=1) + "\n")
+    write_text(path, json.dumps(values, indent=1) + "\n")

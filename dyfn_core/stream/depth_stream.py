@@ -101,6 +101,12 @@ class StreamMemory:
             return broken
         return None if self.image_size in (None, size) else NEW_SIZE
 
+    def after(
+        self, size: tuple[int, int], stamp: float | None, state: StreamState | None
+    ) -> StreamMemory:
+        """The memory after one more frame, of size (H, W); the filters are as they were."""
+        return replace(self, frames=self.frames + 1, image_size=size, stamp=stamp, state=state)
+
 
 def same_camera(one: np.ndarray | None, other: np.ndarray | None) -> bool:
     """Whether two camera matrices, None when unknown, are equal."""
@@ -277,13 +283,7 @@ class DepthStream:
         self._make_room(size, None)
         samples, usable = sample(affine.points, valid)
         xyz, uv = samples[0][usable[0]], sampled_uv(*size)[usable[0]]
-        memory = replace(
-            self.memory,
-            frames=self.memory.frames + 1,
-            image_size=size,
-            stamp=stamp,
-            state=state,
-        )
+        memory = self.memory.after(size, stamp, state)
         if self._camera_matrix is not None:
             known = normalize_intrinsics(self._camera_matrix, size)
             intrinsics = torch.from_numpy(known)[None]
@@ -320,14 +320,7 @@ class DepthStream:
         prediction = from_disparity(
             disparity, disparity.new_tensor([unit]), intrinsics.to(disparity), state
         )
-        memory = replace(
-            self.memory,
-            frames=self.memory.frames + 1,
-            image_size=size,
-            stamp=stamp,
-            state=state,
-            unit=unit,
-        )
+        memory = replace(self.memory.after(size, stamp, state), unit=unit)
         return self._finished(prediction, memory)
 
     def _finished(self, prediction: Prediction, memory: StreamMemory) -> Prediction:

@@ -20,9 +20,8 @@ TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
 # Names in lower case. A device that is called after its depth says nothing about its topics.
 _DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$)")
 _OF_DEPTH = re.compile(r"depth|disparity")
-_COLOUR_SPACE = re.compile(
-    r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/"
-)  # a namespace, no picture's own name
+# A namespace, not the name of a picture.
+_COLOUR_SPACE = re.compile(r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/")
 _OTHER_LIGHT = re.compile(
     r"infra|thermal|lwir|lepton|amplitude|intensity|confidence|(?:^|[/_])ir_?\d*(?:[/_]|$)"
 )
@@ -59,7 +58,7 @@ def choose_topics(
     is named. Raises RecordingError: a named topic that is absent or of another type, no image
     topic, several candidates.
     """
-    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    kinds = _kinds(storage)
     colours, depths = _classify(storage, kinds)
     images = {IMAGE, COMPRESSED_IMAGE}
     visible = [name for name in colours if not _OTHER_LIGHT.search(name.lower())] or colours
@@ -87,6 +86,11 @@ def choose_topics(
 def topic_remarks(storage: Storage, topics: Topics) -> list[str]:
     """What is recorded, or should be, and is not used although that might be expected."""
     return [*_fuller_twins(storage, [topics.image, topics.depth]), *_empty(storage)]
+
+
+def _kinds(storage: Storage) -> dict[str, str]:
+    """Message type of every topic that holds messages."""
+    return {name: topic.kind for name, topic in storage.topics.items() if topic.count}
 
 
 def _no_image(path: Path, storage: Storage, kinds: dict[str, str]) -> RecordingError:
@@ -139,7 +143,7 @@ def choose_reference(path: Path, storage: Storage, name: str | None, kind: str) 
     Raises:
         RecordingError: The topic is absent or of another type, or there are several.
     """
-    kinds = {topic: found.kind for topic, found in storage.topics.items() if found.count}
+    kinds = _kinds(storage)
     depths = _classify(storage, kinds)[1] if name is None and kind == IMAGE else [*kinds]
     candidates = sorted(topic for topic in depths if kinds[topic] == kind)
     found = _named(path, kinds, name, {kind}) or _only(path, kinds, candidates, "reference")
@@ -152,7 +156,7 @@ def choose_reference(path: Path, storage: Storage, name: str | None, kind: str) 
 
 def listed_topics(storage: Storage) -> str:
     """Every topic that holds messages, with its type, for messages to a user."""
-    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    kinds = _kinds(storage)
     return _listing(kinds, kinds)
 
 
@@ -161,7 +165,7 @@ def image_topics(path: Path, storage: Storage) -> list[str]:
 
     Raises RecordingError when there is none.
     """
-    kinds = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    kinds = _kinds(storage)
     colours, _ = _classify(storage, kinds)
     if not colours:
         raise _no_image(path, storage, kinds)

@@ -17,7 +17,7 @@ from typing import Any
 from tqdm import tqdm
 
 from dyfn_core.data.files import hidden
-from dyfn_core.files import finished_file
+from dyfn_core.files import write_text
 from dyfn_core.models.checkpoints import model_fingerprint
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
@@ -238,8 +238,7 @@ def _remember(job: BatchJob, outcome: Outcome) -> None:
     folder = job.job.outputs.folder
     folder.mkdir(parents=True, exist_ok=True)
     known = {"key": job.key, "recording": str(job.job.source.recording), **asdict(outcome)}
-    with finished_file(folder / "outcome.json") as partial:
-        partial.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
+    write_text(folder / "outcome.json", json.dumps(known, indent=2) + "\n")
 
 
 def _row(job: BatchJob, outcome: Outcome) -> Row:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import bootstrap
 
 from dyfn_core.evaluation.report.html import format_cell
-from dyfn_core.files import finished_file
+from dyfn_core.files import finished_file, write_text
 
 SCORES = {
     "image_abs_rel": ("image", "abs_rel"),
@@ -95,8 +95,7 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     averages = means(rows)
     text = _markdown(rows, averages)
-    with finished_file(folder / "summary.md") as partial:
-        partial.write_text(text + "\n", encoding="utf-8")
+    write_text(folder / "summary.md", text + "\n")
     with (
         finished_file(folder / "summary.csv") as partial,
         partial.open("w", newline="", encoding="utf-8") as file,
@@ -109,8 +108,7 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> str:
         "means": {name: mean and vars(mean) for name, mean in averages.items()},
         "interval": {"confidence": CONFIDENCE, "resamples": RESAMPLES, "seed": SEED},
     }
-    with finished_file(folder / "summary.json") as partial:
-        partial.write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
     return text
 
 

@@ -15,7 +15,7 @@ from dyfn_core.evaluation.report.html import Section, Table, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import SequenceEvaluation
-from dyfn_core.files import finished_file
+from dyfn_core.files import finished_file, write_text
 from dyfn_core.scoring.protocols import CONTROLS
 from dyfn_ros.recordings.frames import Recording
 from dyfn_ros.replay.settings import Outputs, Source
@@ -71,11 +71,9 @@ def write_results(
         partial.write_bytes(encode_picture(result.evaluation.draw_strip()))
     with finished_file(folder / "frames.csv") as partial:
         _write_rows(partial, result.evaluation)
-    with finished_file(folder / "report.html") as partial:
-        _write_report(partial, metrics, result)
+    _write_report(folder / "report.html", metrics, result)
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
-    with finished_file(folder / "metrics.json") as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_text(folder / "metrics.json", text)
     return metrics
 
 

@@ -18,7 +18,7 @@ from dyfn_core.evaluation.report.curves import (
 )
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.style import SCRIPT, STYLE
-from dyfn_core.files import finished_file
+from dyfn_core.files import write_text
 
 Cell = str | float | int | None
 
@@ -78,8 +78,7 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> N
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
         f"<body><h1>{escape(title)}</h1>\n<nav>{links}</nav>\n{body}\n{script}</body></html>\n"
     )
-    with finished_file(Path(path)) as partial:
-        partial.write_text(page, encoding="utf-8")
+    write_text(Path(path), page)
 
 
 def _section(number: int, section: Section) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -39,15 +41,7 @@ def align_clips(
     Raises:
         ValueError: For another mode.
     """
-    check_mode(mode)
-    frames = 1 if mode == "first" else target.length
-    index = coarse_samples(target.frames, FIRST_GRID if mode == "first" else ALL_GRID)[:1]
-
-    def sample(values: Tensor) -> Tensor:
-        chosen = values[:, :frames].flatten(0, 1)
-        picked = pick(chosen, index.expand(len(chosen), -1))
-        return torch.unflatten(picked, 0, (-1, frames)).flatten(1, 2)
-
+    sample = coarse_sampler(target, mode)
     weight = sample(target.weight)
     anchors = torch.multinomial(weight + 1e-9, ANCHORS)
     scale, shift = align_points(
@@ -57,6 +51,31 @@ def align_clips(
         scale, shift = _least_squares(sample(points), sample(target.points), weight, scale, shift)
     usable = scale > 0
     return torch.where(usable, scale, 0.0), torch.where(usable[:, None], shift, 0.0)
+
+
+def coarse_sampler(target: ClipTarget, mode: str) -> Callable[[Tensor], Tensor]:
+    """What takes the samples of a clip's alignment out of B x T x H x W (x C) values.
+
+    Args:
+        target: The true geometry of the clips, which says where there are samples.
+        mode: "first" samples the first frame alone, "all" every frame more coarsely.
+
+    Returns:
+        A function that gives the samples, B x N (x C).
+
+    Raises:
+        ValueError: For another mode.
+    """
+    check_mode(mode)
+    frames = 1 if mode == "first" else target.length
+    index = coarse_samples(target.frames, FIRST_GRID if mode == "first" else ALL_GRID)[:1]
+
+    def sample(values: Tensor) -> Tensor:
+        chosen = values[:, :frames].flatten(0, 1)
+        picked = pick(chosen, index.expand(len(chosen), -1))
+        return torch.unflatten(picked, 0, (-1, frames)).flatten(1, 2)
+
+    return sample
 
 
 def _least_squares(

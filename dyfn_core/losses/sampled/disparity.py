@@ -8,10 +8,8 @@ import torch
 from torch import Tensor
 
 from dyfn_core.geometry.alignment import align_scale_shift
-from dyfn_core.losses.clip_alignment import check_mode
-from dyfn_core.losses.resample import pick
-from dyfn_core.losses.sampled.clip_alignment import ALL_GRID, ANCHORS, FIRST_GRID, TRUNC
-from dyfn_core.losses.sampled.whole_frame import coarse_samples
+from dyfn_core.losses.motion import pair_change_loss
+from dyfn_core.losses.sampled.clip_alignment import ANCHORS, TRUNC, coarse_sampler
 from dyfn_core.losses.target import ClipTarget
 
 
@@ -43,15 +41,7 @@ def align_disparity(disparity: Tensor, target: ClipTarget, mode: str) -> tuple[T
     Raises:
         ValueError: For another mode.
     """
-    check_mode(mode)
-    frames = 1 if mode == "first" else target.length
-    index = coarse_samples(target.frames, FIRST_GRID if mode == "first" else ALL_GRID)[:1]
-
-    def sample(values: Tensor) -> Tensor:
-        chosen = values[:, :frames].flatten(0, 1)
-        picked = pick(chosen, index.expand(len(chosen), -1))
-        return torch.unflatten(picked, 0, (-1, frames)).flatten(1)
-
+    sample = coarse_sampler(target, mode)
     truth, weight = (sample(values) for values in true_disparity(target))
     anchors = torch.multinomial(weight + 1e-9, ANCHORS)
     scale, shift = align_scale_shift(sample(disparity.detach()), truth, weight, TRUNC, anchors)
@@ -96,14 +86,7 @@ def disparity_temporal_loss(
     Returns:
         The mean over pixels that are valid in both frames; 0 without pairs or common pixels.
     """
-    if not pairs:
-        return (disparity * 0).sum()
-    first = torch.tensor([pair[0] for pair in pairs], device=disparity.device)
-    second = torch.tensor([pair[1] for pair in pairs], device=disparity.device)
     truth, weight = true_disparity(target)
-    moved = (disparity[:, first] - disparity[:, second]).abs()
-    truly = (truth[:, first] - truth[:, second]).abs()
-    both = target.valid[:, first] & target.valid[:, second]
-    both = both & (scale > 0)[:, None, None, None]
-    error = (scale[:, None, None, None] * moved - truly).abs() * weight[:, first]
-    return (error * both).sum() / both.sum().clamp(min=1)
+    return pair_change_loss(
+        disparity[..., None], truth[..., None], target.valid, weight, scale, pairs
+    )
