@@ -10,7 +10,7 @@ from typing import IO
 import cv2
 import numpy as np
 
-from dyfn_core.data.axes import inverse
+from dyfn_core.geometry.rigid import inverse
 from dyfn_core.prediction import DEPTH
 from dyfn_core.scoring.protocols import MIN_DEPTH, MIN_PIXELS, align_depth, sample_grid, to_shape
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from dyfn_core.data.axes import inverse, quaternion_rotation, rigid
+from dyfn_core.geometry.rigid import inverse, quaternion_rotation, rigid
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_poses
 from dyfn_ros.recordings.storage.open import Storage, open_storage

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.data.axes import ned_body_pose, quaternion_rotation, rigid
+from dyfn_core.data.axes import ned_body_pose
 from dyfn_core.data.files import (
     folders_holding,
     needed,
@@ -20,6 +20,7 @@ from dyfn_core.data.files import (
     with_depth,
 )
 from dyfn_core.data.frames import DataReport, FrameSequence, RgbdFrame, uninterrupted
+from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
 EXPECTED = (
     "<environment>/<climate>/ with color_left/trajectory_0000/000000.JPEG, "

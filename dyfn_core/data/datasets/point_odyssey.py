@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.axes import inverse
 from dyfn_core.data.files import (
     folders_holding,
     numbered_files,
@@ -25,6 +24,7 @@ from dyfn_core.data.frames import (
     camera_intrinsics,
     uninterrupted,
 )
+from dyfn_core.geometry.rigid import inverse
 
 EXPECTED = "train/<sequence>/ with rgbs/rgb_00000.jpg, depths/depth_00000.png and anno.npz"
 LARGEST_DEPTH = 1000.0  # metres, stored as 65535

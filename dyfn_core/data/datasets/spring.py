@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.data.axes import inverse
 from dyfn_core.data.files import (
     folders_holding,
     needed,
@@ -27,6 +26,7 @@ from dyfn_core.data.frames import (
     camera_intrinsics,
     uninterrupted,
 )
+from dyfn_core.geometry.rigid import inverse
 
 EXPECTED = (
     "train/0001/ with frame_left/frame_left_0001.png, disp1_left/disp1_left_0001.dsp5 and "

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.axes import ned_body_pose, quaternion_rotation, rigid
+from dyfn_core.data.axes import ned_body_pose
 from dyfn_core.data.files import (
     folders_holding,
     numbered_files,
@@ -18,6 +18,7 @@ from dyfn_core.data.files import (
     with_depth,
 )
 from dyfn_core.data.frames import DataReport, FrameError, FrameSequence, RgbdFrame, uninterrupted
+from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
 EXPECTED = (
     "<environment>/{Easy,Hard}/P000/ with image_left/000000_left.png, "

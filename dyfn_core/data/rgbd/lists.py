@@ -9,9 +9,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from dyfn_core.data.axes import quaternion_rotation, rigid
 from dyfn_core.data.files import read_table, usable_poses
 from dyfn_core.data.frames import DataError, DataReport
+from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
 Thing = TypeVar("Thing")
 Stamped = tuple[float, Path]

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.axes import inverse
 from dyfn_core.data.files import numbered_files, read_colour, with_depth
 from dyfn_core.data.frames import DataReport, FrameError
 from dyfn_core.evaluation.benchmarks.sets.base import (
@@ -16,6 +15,7 @@ from dyfn_core.evaluation.benchmarks.sets.base import (
     BenchmarkSource,
     one_by_one,
 )
+from dyfn_core.geometry.rigid import inverse
 
 EXPECTED = (
     "training/{clean,final}/<sequence>/frame_0001.png and "
