@@ -71,6 +71,7 @@ class Camera:
         self.title = f"{node.get_name()}: {name}" if name else node.get_name()
         self.statistics = FrameStatistics()
         self.active = False
+        self.abandoned = False  # the node has ended; a frame that is still worked on is lost
         self.session: StreamSession | None = None  # once there is a model
         self.outputs = NodeOutputs(ports, self.prefix, not settings().drop_frames)
         self._node, self._settings = node, settings
@@ -226,7 +227,7 @@ class Camera:
         """The network, or publishing, failed on the job."""
         if self.session is not None:
             self.session.fail()
-        if not self._node.context.ok():  # shut down under our feet: nobody to publish to
+        if self.abandoned or not self._node.context.ok():  # nobody to publish to
             self.statistics.count("unpublished")
             return
         self.statistics.count("failed")

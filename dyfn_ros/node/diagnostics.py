@@ -18,7 +18,8 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class Report:
     """What is known at one moment.
 
-    phase: lifecycle state. mismatches: incompatible QoS by topic. dropped: frames per camera.
+    phase: lifecycle state. callback_errors: callbacks that raised, so far.
+    mismatches: incompatible QoS by topic. dropped: frames per camera.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Report:
     settings: NodeSettings
     device: str
     error: BaseException | None
+    callback_errors: int
     mismatches: Mapping[str, str]
     cameras: Sequence[Camera]
     dropped: Sequence[int]
@@ -63,6 +65,7 @@ def _node(report: Report) -> DiagnosticStatus:
         "device": report.device,
         "stabilizer": "on" if report.settings.stabilize else "off",
         "cameras": str(len(report.cameras)),
+        "failed callbacks": str(report.callback_errors),
     }
     values.update({f"incompatible QoS {t}": m for t, m in sorted(report.mismatches.items())})
     return _status(report.name, problems, report.phase, values)

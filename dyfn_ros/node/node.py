@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.parameters.declare import NodeParameters
 from dyfn_ros.node.parameters.table import NodeSettings
+from dyfn_ros.node.service_guard import guard_services
 from dyfn_ros.node.topics import NodeTopics
 from dyfn_ros.node.worker import FrameWorker
 
@@ -33,8 +35,9 @@ if TYPE_CHECKING:
 ModelLoader = Callable[[str, str], "GeometryModel"]
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-_PATIENCE = 4.0  # seconds; ROS launch loses its own after 5
-_POLL = 0.1  # seconds between looks at the context while the model is loaded
+_PATIENCE = 4.0  # seconds that a transition waits for the frame being worked on
+_LAST_PATIENCE = 2.0  # the same at the end of the process, see end_request.BOUND
+_POLL = 0.1  # seconds between looks at what else may end the wait for a model
 
 
 class StreamDepthNode(LifecycleNode):
@@ -42,13 +45,22 @@ class StreamDepthNode(LifecycleNode):
 
     Callbacks only store and queue; decoding, inference and publishing happen in one worker
     thread, which lives from configure to cleanup.
+
+    ending: whether the process is asked to end; a model is then waited for no longer.
     """
 
-    def __init__(self, load: ModelLoader = load_model, **node_options: Any) -> None:
+    def __init__(
+        self,
+        load: ModelLoader = load_model,
+        ending: Callable[[], bool] = lambda: False,
+        **node_options: Any,
+    ) -> None:
         super().__init__("stream_depth", **node_options)
-        self._load = load
         self._throttle = Throttle()
+        guard_services(self, self._warn)
+        self._load, self._ending = load, ending
         self._phase = "unconfigured"
+        self._callback_errors = 0
         self._device = ""
         self._worker: FrameWorker[FrameJob] | None = None
         self._cameras: list[Camera] = []
@@ -80,6 +92,12 @@ class StreamDepthNode(LifecycleNode):
         if line := self._throttle(text):
             self.get_logger().error(line)
 
+    def callback_failed(self, error: Exception) -> None:
+        """A callback raised, which nobody foresaw: it is counted, and the node goes on."""
+        self._callback_errors += 1
+        place = "".join(traceback.format_tb(error.__traceback__)[-1:]).strip()
+        self._error(f"a callback failed: {type(error).__name__}: {error} ({place})")
+
     # Transitions.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -102,15 +120,19 @@ class StreamDepthNode(LifecycleNode):
         self._cameras = [self._make_camera(i, name) for i, name in enumerate(settings.cameras)]
         self._make_services()
         self._worker.start()
-        while self.context.ok() and not self._worker.wait_prepared(_POLL):
+        while not self._interrupted and not self._worker.wait_prepared(_POLL):
             pass
         if self._worker.error is not None:
             self.get_logger().error(f"cannot configure: {self._worker.error!r}")
-        if self._worker.error is not None or not self.context.ok():
-            self._release_all()
+        if self._worker.error is not None or self._interrupted:
+            self._release_all(0.0)
             return FAILURE
         self._phase = "inactive"
         return super().on_configure(state)
+
+    @property
+    def _interrupted(self) -> bool:
+        return self._ending() or not self.context.ok()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Frames that come from now on are worked on."""
@@ -128,12 +150,12 @@ class StreamDepthNode(LifecycleNode):
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Give the model, the topics and the memory back."""
-        self._release_and_say()
+        self._release_all()
         return super().on_cleanup(state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """As cleanup; the node cannot be configured again."""
-        self._release_and_say()
+        self._release_all()
         self._phase = "finalized"
         return super().on_shutdown(state)
 
@@ -149,22 +171,21 @@ class StreamDepthNode(LifecycleNode):
             if not active and self._worker is not None:
                 self._worker.discard(index)
 
-    def _release_all(self) -> tuple[list[str], bool]:
-        """-> the last words about each camera, and whether the worker ended."""
+    def _release_all(self, patience: float = _PATIENCE) -> None:
+        """Undo configure. patience: seconds for the frame that is being worked on."""
         self._set_active(False)
-        done = self._worker is None or self._worker.stop(_PATIENCE)
+        if self._worker is not None and not self._worker.stop(patience):
+            for camera in self._cameras:
+                camera.abandoned = True
+        if self._phase in ("inactive", "active"):
+            for line in self._summary():
+                self.get_logger().info(line)
         for undo in reversed(self._made):
             undo()
         self._made = []
         self._ports.close()
-        lines = self._summary()
         self._cameras, self._worker = [], None
         self._phase = "unconfigured"
-        return lines, done
-
-    def _release_and_say(self) -> None:
-        for line in self._release_all()[0]:
-            self.get_logger().info(line)
 
     # What a configured node is made of.
 
@@ -267,6 +288,7 @@ class StreamDepthNode(LifecycleNode):
             settings=self.settings,
             device=self._device,
             error=self.worker_error,
+            callback_errors=self._callback_errors,
             mismatches=self._ports.mismatches,
             cameras=self._cameras,
             dropped=[self._dropped(index) for index in range(len(self._cameras))],
@@ -288,7 +310,7 @@ class StreamDepthNode(LifecycleNode):
         for camera in self._cameras:
             camera.open_stream(model)
         self._device = device
-        if self.context.ok():  # loading takes long enough to be interrupted
+        if not self._interrupted:  # loading takes long enough
             sources = {camera.settings.metric_source for camera in self._cameras} - {"none"}
             unit = f"metres come from {', '.join(sorted(sources))}"
             if not sources:
@@ -319,11 +341,7 @@ class StreamDepthNode(LifecycleNode):
             )
         return lines
 
-    def close(self) -> bool:
-        """Release everything and say what became of the frames. -> whether the worker is done."""
-        logger = self.get_logger()
-        lines, done = self._release_all()
-        self.destroy_node()  # first: a signal ends, now or soon, the context that rosout needs
-        for line in lines:
-            logger.info(line)
-        return done
+    def close(self) -> None:
+        """Say what became of the frames, and release everything."""
+        self._release_all(_LAST_PATIENCE)
+        self.destroy_node()

@@ -93,9 +93,22 @@ class NodeProcess:
             self.process.send_signal(number)
         try:
             return self.process.wait(DEADLINE)
-        except subprocess.TimeoutExpired:
-            self.kill()
-            raise
+        except subprocess.TimeoutExpired as error:
+            self.process.send_signal(signal.SIGABRT)  # the fault handler says where it stands
+            self.process.wait(10)
+            raise AssertionError(f"{error}; the node's log:\n{self.log}") from error
+
+    def wait_listening(self) -> None:
+        """Until the process has blocked SIGINT for itself: from then on it knows what one means."""
+        status = Path(f"/proc/{self.process.pid}/status")
+        deadline = time.monotonic() + DEADLINE
+        while True:
+            assert self.process.poll() is None, f"the node ended:\n{self.log}"
+            assert time.monotonic() < deadline, "the node blocks no signal"
+            blocked = re.search(r"SigBlk:\s*(\w+)", status.read_text())
+            if blocked and int(blocked.group(1), 16) & 1 << (signal.SIGINT - 1):
+                return
+            time.sleep(0.01)
 
     def kill(self) -> None:
         if self.process.poll() is None:

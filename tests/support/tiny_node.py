@@ -1,13 +1,13 @@
-"""stream_depth with the tiny model (or "pinhole"), as a process of its own."""
+"""stream_depth with the tiny model (or "pinhole", or "endless"), as a process of its own."""
 
 from __future__ import annotations
 
 import ctypes
 import signal
 import sys
+import threading
 from typing import TYPE_CHECKING
 
-from dyfn_ros.node import outputs
 from dyfn_ros.node.main import main
 
 if TYPE_CHECKING:
@@ -15,20 +15,30 @@ if TYPE_CHECKING:
 
 
 def load(name: str, device: str) -> GeometryModel:
+    if name == "endless":
+        print("loading for ever", flush=True)
+        threading.Event().wait()
     from tests.support.pinhole import PinholeModel
     from tests.support.tiny_model import load_tiny
 
+    for builder in ("depth_message", "cloud_message", "colour_message", "compressed_message"):
+        report(builder)
     return PinholeModel().eval() if name == "pinhole" else load_tiny(name, device)
 
 
 def report(name: str) -> None:
     """Print each call of a message builder, so that a test sees what was built for nobody."""
+    from dyfn_ros.node import outputs
+
     build = getattr(outputs, name)
+    if hasattr(build, "reported"):  # by a model that was loaded before
+        return
 
     def reported(*args: object) -> object:
         print(name, flush=True)
         return build(*args)
 
+    reported.reported = True  # type: ignore[attr-defined]
     setattr(outputs, name, reported)
 
 
@@ -40,6 +50,4 @@ def die_with_parent() -> None:
 
 if __name__ == "__main__":
     die_with_parent()
-    for builder in ("depth_message", "cloud_message", "colour_message", "compressed_message"):
-        report(builder)
-    sys.exit(main(load=load))
+    main(load=load)

@@ -163,6 +163,8 @@ class NodeParameters:
         return NodeSettings(**values)
 
     def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
+        if not all(parameter.name for parameter in changes):  # rclpy takes it for a success
+            return SetParametersResult(successful=False, reason="a parameter without a name")
         declared = {
             name: self._node.get_parameter(name).value
             for name in SPECS
