@@ -28,6 +28,11 @@ class Frame:
         visible: H x W bool, False where the image shows nothing (the border of an undistorted
             image); None: everything is visible.
         frame_id: Name of the optical frame. Another name is another camera.
+        pose: 4 x 4 float64, camera to world in metres, of the optical frame (x right, y down, z
+            forward), by the robot's odometry; None when unknown. Used by metric_source "odometry".
+        pose_variance: What the odometry says of its own errors: variance per axis of rotation
+            (rad^2) and translation (m^2), accumulated along the way to this pose, so that the
+            difference between two frames is that of the motion between them. None when unknown.
     """
 
     image: np.ndarray
@@ -35,6 +40,8 @@ class Frame:
     camera_matrix: np.ndarray | None = None
     visible: np.ndarray | None = None
     frame_id: str = ""
+    pose: np.ndarray | None = None
+    pose_variance: tuple[float, float] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -158,6 +165,9 @@ class Prediction(Generic[ArrayT]):
             intrinsics are an estimate.
         reset: Why the stream was reset with this frame; None when it went on, or was the first.
         metric: Whether points and depth are in metres; else they are right up to one scale.
+        unit: depth / unit keeps one scale over the whole stream, also where metres begin or end.
+        withheld: H x W bool, what `mask` leaves out only because its metres are not known; None
+            when that is nothing.
     """
 
     points: ArrayT
@@ -170,6 +180,8 @@ class Prediction(Generic[ArrayT]):
     known_camera: np.ndarray | None = None
     reset: str | None = None
     metric: bool = False
+    unit: float = 1.0
+    withheld: ArrayT | None = None
 
     @property
     def camera_matrix(self) -> np.ndarray:
@@ -188,11 +200,14 @@ class Prediction(Generic[ArrayT]):
     def aligned_quantity(self) -> tuple[ArrayT, ArrayT]:
         """What scores align with truth, H x W, and where it is valid, H x W bool.
 
-        Depth; or disparity, which is valid also where its inverse is too far to be depth.
+        Depth in the stream's own unit, also where its metres are withheld; or disparity, which is
+        valid also where its inverse is too far to be depth.
         """
         if self.disparity is not None:
             return self.disparity, abs(self.disparity) < math.inf
-        return self.depth, self.valid
+        known = self.mask if self.withheld is None else self.mask | self.withheld
+        depth = self.depth if self.unit == 1.0 else self.depth / self.unit
+        return depth, known & (depth > 0) & (depth < math.inf)
 
     def numpy(self) -> Prediction[np.ndarray]:
         """The same with numpy arrays in place of tensors.
@@ -211,6 +226,8 @@ class Prediction(Generic[ArrayT]):
             self.known_camera,
             self.reset,
             self.metric,
+            self.unit,
+            None if self.withheld is None else _array(self.withheld),
         )
 
     def scaled(self, scale: float) -> Prediction[ArrayT]:

@@ -19,6 +19,7 @@ from dyfn_core.scoring.protocols import (
     SequenceScore,
     SequenceScorer,
     spread,
+    to_shape,
 )
 from dyfn_core.scoring.variants import VariantScorers
 
@@ -66,6 +67,7 @@ class SequenceEvaluation:
         self.worst = WorstFrames(expected_frames, quantity)
         self._stamps, self._latencies = array("d"), array("d")  # seconds
         self._metric = array("b")
+        self._metres = SequenceScorer(depth_max)
         self._hash = hashlib.sha256()
 
     def push(
@@ -78,16 +80,21 @@ class SequenceEvaluation:
         stamp: float,
         latency: float,
         metric: bool = False,
+        steady: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> FrameScore:
         """One frame.
 
         image: H x W x 3 uint8 RGB. depth: H x W up to scale (or disparity); valid: H x W bool.
         truth: metres, NaN invalid, of the same field of view (any size); None when unknown.
-        stamp, latency: seconds. metric: whether depth is in metres. Raises ValueError when truth
-        has another aspect ratio.
+        stamp, latency: seconds. metric: whether depth is in metres. steady: depth and valid in one
+        unit for the whole sequence, for what is aligned, where the output has a unit that changes
+        or is withheld at times; None: as depth and valid. Raises ValueError when truth has another
+        aspect ratio.
         """
-        masked = np.where(valid, depth, np.nan).astype(np.float32)
-        self._hash.update(masked.tobytes())
+        output = np.where(valid, depth, np.nan).astype(np.float32)
+        self._hash.update(output.tobytes())
+        masked = output if steady is None else np.where(steady[1], steady[0], np.nan)
+        masked = masked.astype(np.float32, copy=False)
         self.strip.add(len(self._stamps), image, masked, truth)
         self._stamps.append(stamp)
         self._latencies.append(latency)
@@ -95,11 +102,18 @@ class SequenceEvaluation:
         if truth is None:
             nothing = np.full((1, 1), np.nan, np.float32)
             self._scorers.push({PREDICTION: nothing}, nothing)
+            self._metres.push(nothing, nothing)
             return self.scorer.frames[-1]
         self._scorers.push({PREDICTION: masked}, truth)
         score = self.scorer.frames[-1]
+        self._push_metres(output if metric else None, truth)
         self.worst.add(len(self._stamps) - 1, image, masked, truth, score)
         return score
+
+    def _push_metres(self, metres: np.ndarray | None, truth: np.ndarray) -> None:
+        if metres is None:
+            metres = truth = np.full((1, 1), np.nan, np.float32)
+        self._metres.push(to_shape(metres, truth.shape), truth)
 
     @property
     def quantity(self) -> str:
@@ -134,7 +148,7 @@ class SequenceEvaluation:
 
         None when no frame was in metres, or there is no truth.
         """
-        score = self.scorer.metric() if self.metric_frames else None
+        score = self._metres.metric() if self.metric_frames else None
         if score is None:
             return None
         rows = MetricRows()

@@ -67,6 +67,7 @@ def track(
     image: np.ndarray,
     options: TrackOptions,
     rotation: np.ndarray | None = None,
+    visible: np.ndarray | None = None,
 ) -> TrackerState:
     """Follow the tracks into the next picture, and begin new ones where there are few.
 
@@ -78,6 +79,8 @@ def track(
         options: see TrackOptions.
         rotation: 3 x 3 homography in pixels of the picture, K R K^-1: where the points would be
             had the camera only turned. It gives the first guess. None: the points' old places.
+        visible: H x W bool, where the image shows something; new tracks keep away from the rest.
+            None: everywhere.
 
     Returns:
         The state after this picture; its `tracks` are the picture's.
@@ -88,7 +91,7 @@ def track(
         next_id = state.next_id
         if state.grey.shape == grey.shape:
             ids, points = _followed(state, grey, scale, options, rotation)
-    fresh = _corners(grey, points, options)
+    fresh = _corners(grey, points, options, visible)
     ids = np.concatenate([ids, np.arange(len(fresh), dtype=np.int64) + next_id])
     points = np.concatenate([points, fresh])
     tracks = Tracks(ids, ((points + 0.5) * scale - 0.5).astype(np.float32))
@@ -152,12 +155,16 @@ def _turned(points: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.n
     return np.asarray((there + 0.5) / scale - 0.5, np.float32)
 
 
-def _corners(grey: np.ndarray, points: np.ndarray, options: TrackOptions) -> np.ndarray:
+def _corners(
+    grey: np.ndarray, points: np.ndarray, options: TrackOptions, visible: np.ndarray | None
+) -> np.ndarray:
     """New corners away from the points there are, N x 2 float32 at the tracking size."""
     room = options.most - len(points)
     if room <= 0:
         return np.empty((0, 2), np.float32)
     mask = _free(grey, points, options.spacing)
+    if visible is not None:
+        mask[_blind(visible, grey)] = 0
     found = cv2.goodFeaturesToTrack(grey, room, _QUALITY, options.spacing, mask=mask)
     if found is None:
         return np.empty((0, 2), np.float32)
@@ -172,6 +179,13 @@ def _free(grey: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
     mask[rows, columns] = 0
     side = 2 * round(spacing) + 1
     return np.asarray(cv2.erode(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))))
+
+
+def _blind(visible: np.ndarray, grey: np.ndarray) -> np.ndarray:
+    """h x w bool at the tracking size: within a patch of what the image does not show."""
+    size = (grey.shape[1], grey.shape[0])
+    nothing = cv2.resize((~visible).astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.dilate(nothing, np.ones(_WINDOW, np.uint8)) > 0)
 
 
 def _inside(points: np.ndarray, grey: np.ndarray, border: float) -> np.ndarray:

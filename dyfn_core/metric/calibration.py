@@ -13,6 +13,7 @@ from dyfn_core.metric.references import Evidence
 
 MODES = ("hold", "track")
 FITS = ("scale", "scale_shift")
+_ANOTHER_STREAM = 0.2  # standard deviation between the log scales of two streams of one camera
 _PATIENT = 10  # evidence this many windows old is never used
 
 
@@ -54,6 +55,19 @@ class CalibrationOptions:
 
 
 @dataclass(frozen=True)
+class ScalePrior:
+    """The scale of before a reset of the stream; a value.
+
+    map: it was in force. spread: relative standard deviation, grown with each reset.
+    points: pairs behind its last agreeing fit.
+    """
+
+    map: MetricMap
+    spread: float
+    points: int
+
+
+@dataclass(frozen=True)
 class ScaleCalibration:
     """All that a calibrator remembers; a value.
 
@@ -62,6 +76,7 @@ class ScaleCalibration:
     started: the first evidence's stamp. window: recent evidence. contradicted_since: stamp of
     the first of the unbroken run of fits that contradict the map; disagrees: for `patience`.
     recalibrations: how often "track" gave up a map. problem: why the last fit failed, or "".
+    prior: what was known before the last reset, for as long as there is no map.
     """
 
     map: MetricMap | None = None
@@ -75,6 +90,7 @@ class ScaleCalibration:
     disagrees: bool = False
     recalibrations: int = 0
     problem: str = ""
+    prior: ScalePrior | None = None
 
 
 class ScaleCalibrator:
@@ -88,9 +104,20 @@ class ScaleCalibrator:
         self.state = ScaleCalibration()
         self.dropped: Counter[str] = Counter()
 
-    def reset(self) -> None:
-        """Forget the calibration: the stream's unit may be another one now."""
-        self.state = ScaleCalibration()
+    def reset(self, keep: bool = False) -> None:
+        """End the calibration: the stream's unit may be another one now.
+
+        keep: remember the scale as a prior, 20% less certain.
+        """
+        state = self.state
+        prior = state.prior
+        if state.map is not None:
+            prior = ScalePrior(state.map, state.spread, state.points)
+        if prior is not None and keep:
+            grown = math.hypot(prior.spread, _ANOTHER_STREAM)
+            self.state = ScaleCalibration(prior=replace(prior, spread=grown))
+        else:
+            self.state = ScaleCalibration()
 
     def push(self, evidence: Evidence) -> None:
         """One measurement, in the order of the stamps. One without pairs moves nothing."""

@@ -17,6 +17,7 @@ _LEAST_NOISE = 0.08  # of a measured log scale
 _NEIGHBOURS = 5  # points whose log ratios err alike
 _TURN = math.radians(0.1), 0.02  # odometry's own noise: radians, and share of the rotation
 _STEP = 1e-3, 0.01  # metres, and share of the translation
+_TRUST = 0.25  # of the usual variances, which an odometry's own account may go down to
 _SHARED = 0.6  # of the latest view's tracks; with fewer left, the picture becomes a view
 _RIGID = 1e-3  # most that a pose's rotation may miss an orthonormal matrix by
 
@@ -83,6 +84,7 @@ class MotionState:
         posed: whether that was the last picture.
         rotation_variance: from the latest view to `pose`, per axis, rad^2.
         translation_variance: the same of the translation, m^2.
+        pose_variance: what the odometry said of `pose`, see `observe`.
     """
 
     tracker: TrackerState | None = None
@@ -91,6 +93,7 @@ class MotionState:
     posed: bool = False
     rotation_variance: float = 0.0
     translation_variance: float = 0.0
+    pose_variance: tuple[float, float] | None = None
 
 
 def _none() -> np.ndarray:
@@ -144,19 +147,25 @@ def observe(
     state: MotionState,
     image: np.ndarray,
     camera_matrix: np.ndarray,
-    pose: np.ndarray,
+    pose: np.ndarray | None,
     options: MotionOptions,
+    pose_variance: tuple[float, float] | None = None,
+    visible: np.ndarray | None = None,
 ) -> tuple[MotionState, MotionPoints]:
     """Follow the tracks into the next picture and triangulate what has moved enough.
 
-    A pose that is not finite or not rigid gives no points; the tracks go on.
+    A pose that is unknown, not finite or not rigid gives no points; the tracks go on.
 
     Args:
         state: after the picture before; it is not changed.
         image: H x W x 3 uint8 RGB, without lens distortion.
         camera_matrix: 3 x 3, pixels of the image.
-        pose: 4 x 4, camera to world, optical axes (x right, y down, z forward), metres.
+        pose: 4 x 4, camera to world, optical axes (x right, y down, z forward), metres; None when
+            unknown.
         options: see MotionOptions.
+        pose_variance: rotation (rad^2) and translation (m^2) per axis, accumulated along the way
+            to this pose by the odometry's own account; None: see step_variance.
+        visible: H x W bool, where the image shows something; None: everywhere.
 
     Returns:
         The state after this picture, and the points it sees.
@@ -165,19 +174,20 @@ def observe(
         ValueError: the camera matrix is no pinhole camera's, or the pose is not 4 x 4.
     """
     camera_matrix = check_camera_matrix(camera_matrix)
-    pose = np.array(pose, np.float64)  # the caller may write to its own later
-    problem = pose_problem(pose)
-    if problem:
-        tracker = track(state.tracker, image, options.tracks)
+    problem = "no pose of the camera" if pose is None else pose_problem(np.asarray(pose))
+    if pose is None or problem:
+        tracker = track(state.tracker, image, options.tracks, visible=visible)
         tracked = len(tracker.tracks.ids)
         state = replace(state, tracker=tracker, posed=False)
         return state, MotionPoints(tracked=tracked, problem=problem)
-    state = _advanced(state, image, camera_matrix, pose, options)
-    assert state.tracker is not None
-    present = _normalised(state.tracker.tracks, camera_matrix)
+    pose = np.array(pose, np.float64)  # the caller may write to its own later
+    state, turn = _advanced(state, camera_matrix, pose, pose_variance)
+    tracker = track(state.tracker, image, options.tracks, turn, visible)
+    state = replace(state, tracker=tracker)
+    present = _normalised(tracker.tracks, camera_matrix)
     pixel = _pixel(image, camera_matrix, options)
     views = _views(state, present, pose)
-    points = _points(views, present, state.tracker.tracks, pixel, options)
+    points = _points(views, present, tracker.tracks, pixel, options)
     if points.rms > options.lost_rms:
         state = replace(state, views=())
     if _is_view(state, views, present, pixel, options):
@@ -225,29 +235,42 @@ def step_variance(relative: np.ndarray) -> tuple[float, float]:
     return rotation, translation
 
 
+def _step_noise(
+    state: MotionState, relative: np.ndarray, now: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Variances of the step: the odometry's own, though never below a share of the usual ones."""
+    rotation, translation = step_variance(relative)
+    if now is None or state.pose_variance is None:
+        return rotation, translation
+    own = [after - before for after, before in zip(now, state.pose_variance, strict=True)]
+    if not all(math.isfinite(value) and value >= 0 for value in own):
+        return rotation, translation
+    return max(own[0], _TRUST * rotation), max(own[1], _TRUST * translation)
+
+
 def _advanced(
     state: MotionState,
-    image: np.ndarray,
     camera_matrix: np.ndarray,
     pose: np.ndarray,
-    options: MotionOptions,
-) -> MotionState:
-    """The tracks in the next picture, its pose and the noise of the way to it."""
+    pose_variance: tuple[float, float] | None,
+) -> tuple[MotionState, np.ndarray | None]:
+    """The next picture's pose with the noise of the way to it; where a mere turn moves pixels."""
     turn = None
     rotation_variance, translation_variance = 0.0, 0.0
     if state.pose is not None:
         relative = np.linalg.inv(pose) @ state.pose
-        rotation_variance, translation_variance = step_variance(relative)
+        rotation_variance, translation_variance = _step_noise(state, relative, pose_variance)
         if state.posed:
             turn = camera_matrix @ relative[:3, :3] @ np.linalg.inv(camera_matrix)
-    return MotionState(
-        track(state.tracker, image, options.tracks, turn),
-        state.views,
-        pose,
-        True,
-        state.rotation_variance + rotation_variance,
-        state.translation_variance + translation_variance,
+    moved = replace(
+        state,
+        pose=pose,
+        posed=True,
+        rotation_variance=state.rotation_variance + rotation_variance,
+        translation_variance=state.translation_variance + translation_variance,
+        pose_variance=pose_variance,
     )
+    return moved, turn
 
 
 def _pixel(image: np.ndarray, camera_matrix: np.ndarray, options: MotionOptions) -> float:

@@ -23,7 +23,13 @@ from dyfn_core.metric.motion import (
 )
 from dyfn_core.metric.point_memory import MemoryOptions, PointMemory, recall, remember
 from dyfn_core.metric.scale_field import FieldOptions, scale_field
-from dyfn_core.metric.scale_filter import FilterOptions, FilterState, predict, update
+from dyfn_core.metric.scale_filter import (
+    FilterOptions,
+    FilterState,
+    predict,
+    restarted,
+    update,
+)
 
 _DOUBT = 2.5  # factor on a point's sigma: points of one frame err alike
 _SHAPE = 0.11  # standard deviation of log depth that the field leaves to the prediction
@@ -42,7 +48,8 @@ class MotionScaleOptions:
         field_sigma_pixels: the same for the part from the noise of the pixels.
         doubt_seconds: time constant of the share of contradicted frames.
         doubt: share of recent frames in which the odometry contradicts the pictures beyond which
-            no metres are given. With the defaults an odometry has to agree for 2.6 s first.
+            no metres are given. With the defaults an odometry has to agree for 3.5 s first.
+        shape_doubt: the same share beyond which neither field nor remembered points are used.
     """
 
     motion: MotionOptions = field(default_factory=MotionOptions)
@@ -52,7 +59,8 @@ class MotionScaleOptions:
     field_sigma: float = 0.5
     field_sigma_pixels: float = 0.2
     doubt_seconds: float = 5.0
-    doubt: float = 0.3
+    doubt: float = 0.25
+    shape_doubt: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -63,17 +71,23 @@ class MotionFrame:
         image: H x W x 3 uint8 RGB, without lens distortion.
         stamp: seconds.
         camera_matrix: 3 x 3, pixels.
-        pose: 4 x 4, camera to world, optical axes (x right, y down, z forward), metres.
+        pose: 4 x 4, camera to world, optical axes (x right, y down, z forward), metres; None when
+            unknown.
         depth: H x W, predicted, right up to the stream's scale.
         valid: H x W bool, where there is a prediction.
+        pose_variance: rotation (rad^2) and translation (m^2) per axis, accumulated along the way
+            to the pose; None when unknown.
+        visible: H x W bool, where the image shows something; None: everywhere.
     """
 
     image: np.ndarray
     stamp: float
     camera_matrix: np.ndarray
-    pose: np.ndarray
+    pose: np.ndarray | None
     depth: np.ndarray
     valid: np.ndarray
+    pose_variance: tuple[float, float] | None = None
+    visible: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +101,8 @@ class MotionScaleState:
         unit: log(metres / unit) of the relative output, locked at the first measurement.
         contradicted: share of recent frames in which the odometry contradicts the pictures; half
             at the start, as nothing is known of it.
-        stamp: of the last frame, seconds.
+        stamp: of the last frame, seconds; None when the time since then is unknown.
+        measured: seconds since the last measurement, at `stamp`; NaN before the first one.
     """
 
     motion: MotionState = field(default_factory=MotionState)
@@ -96,6 +111,17 @@ class MotionScaleState:
     unit: float | None = None
     contradicted: float = 0.5
     stamp: float | None = None
+    measured: float = math.nan
+
+    def restarted(self, options: MotionScaleOptions) -> MotionScaleState:
+        """What is known when the stream of predictions was reset: the scale, less certain.
+
+        Tracks and points end; the unit stays. Stamps may go on at any time.
+        """
+        scale = None if self.scale is None else restarted(self.scale, options.scale)
+        return MotionScaleState(
+            scale=scale, unit=self.unit, contradicted=self.contradicted, measured=self.measured
+        )
 
 
 @dataclass(frozen=True)
@@ -154,21 +180,29 @@ def step(
     """
     _check(frame)
     motion, points = observe(
-        state.motion, frame.image, frame.camera_matrix, frame.pose, options.motion
+        state.motion,
+        frame.image,
+        frame.camera_matrix,
+        frame.pose,
+        options.motion,
+        frame.pose_variance,
+        frame.visible,
     )
-    state = replace(_doubted(state, points, frame.stamp, options), motion=motion)
+    elapsed = 0.0 if state.stamp is None else max(frame.stamp - state.stamp, 0.0)
+    state = replace(_doubted(state, points, elapsed, options), motion=motion, stamp=frame.stamp)
     state, points = _remembered(state, points, frame, options)
     ratios = log_ratios(points, frame.depth, frame.valid)
     measured = measure_scale(points, ratios, frame.depth.shape, options.motion)
     scale = _filtered(state.scale, measured, frame.stamp, options.scale)
     unit = scale.log_scale if state.unit is None and scale is not None else state.unit
-    state = replace(state, scale=scale, unit=unit)
+    age = state.measured + elapsed if measured is None else 0.0
+    state = replace(state, scale=scale, unit=unit, measured=age)
     if scale is None or unit is None:
         nothing = np.zeros(frame.depth.shape, np.float32)
         return state, MotionScale(0.0, nothing, None, math.nan, points, None, points.problem)
     found = MotionScale(
         log_scale=scale.log_scale - unit,
-        field=_field(points, ratios - scale.log_scale, frame, options),
+        field=_field(state, points, ratios - scale.log_scale, frame, options),
         metric=math.exp(unit) if state.contradicted <= options.doubt else None,
         sigma=scale.sigma,
         points=points,
@@ -192,14 +226,14 @@ def _check(frame: MotionFrame) -> None:
 
 
 def _doubted(
-    state: MotionScaleState, points: MotionPoints, stamp: float, options: MotionScaleOptions
+    state: MotionScaleState, points: MotionPoints, elapsed: float, options: MotionScaleOptions
 ) -> MotionScaleState:
     """How often the odometry contradicts the pictures; frames that cannot tell do not count."""
     share = state.contradicted
-    if state.stamp is not None and math.isfinite(points.rms):
-        keep = math.exp(-max(stamp - state.stamp, 0.0) / options.doubt_seconds)
+    if math.isfinite(points.rms):
+        keep = math.exp(-elapsed / options.doubt_seconds)
         share = keep * share + (1 - keep) * bool(points.problem)
-    return replace(state, contradicted=share, stamp=stamp)
+    return replace(state, contradicted=share)
 
 
 def _doubt_problem(state: MotionScaleState, options: MotionScaleOptions) -> str:
@@ -218,9 +252,11 @@ def _remembered(
     if points.rms > options.motion.lost_rms:
         return replace(state, memory=PointMemory()), points
     camera, pose, stamp = frame.camera_matrix, frame.pose, frame.stamp
+    assert pose is not None
     size = (frame.depth.shape[0], frame.depth.shape[1])
     memory = remember(state.memory, points, camera, pose, stamp, options.memory)
-    points = recall(state.memory, points, camera, pose, stamp, size, options.memory)
+    if state.contradicted <= options.shape_doubt:
+        points = recall(state.memory, points, camera, pose, stamp, size, options.memory)
     return replace(state, memory=memory), points
 
 
@@ -236,12 +272,17 @@ def _filtered(
 
 
 def _field(
-    points: MotionPoints, residuals: np.ndarray, frame: MotionFrame, options: MotionScaleOptions
+    state: MotionScaleState,
+    points: MotionPoints,
+    residuals: np.ndarray,
+    frame: MotionFrame,
+    options: MotionScaleOptions,
 ) -> np.ndarray:
-    """H x W float32; 0 where the field is switched off or has too few points."""
+    """H x W float32; 0 where the field is switched off, not to be trusted or without points."""
     good = np.isfinite(residuals) & (points.sigma < options.field_sigma)
     good &= points.sigma_pixels < options.field_sigma_pixels
-    if options.field is None or good.sum() < options.motion.fewest:
+    doubted = state.contradicted > options.shape_doubt
+    if options.field is None or doubted or good.sum() < options.motion.fewest:
         return np.zeros(frame.depth.shape, np.float32)
     noise = np.hypot(_DOUBT * points.sigma[good], _SHAPE)
     depth = np.where(frame.valid, frame.depth, np.nan)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibrator
+from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibrator, ScalePrior
 from dyfn_core.metric.fit import MetricMap
 from dyfn_core.metric.ground import ground_evidence, up_from_pitch
 from dyfn_core.metric.references import DepthView, Reference
@@ -56,7 +56,8 @@ class ScaleInForce:
     deviation of what the scale was found from (0 for a fixed one, NaN unknown).
     age: seconds since a measurement last agreed with it (0 for a fixed one, NaN unknown).
     points: pairs behind the last agreeing fit. disagrees: the measurements contradict it.
-    problem: why there is none, or what speaks against it; "" if all is well.
+    problem: why there is none, or what speaks against it; "" if all is well. kept: the scale is
+    of before a reset of the stream, and nothing has been measured since.
     """
 
     source: str
@@ -67,6 +68,7 @@ class ScaleInForce:
     disagrees: bool = False
     recalibrations: int = 0
     problem: str = ""
+    kept: bool = False
 
     @property
     def metric(self) -> bool:
@@ -78,7 +80,7 @@ class ScaleInForce:
         """What a user who configured a source must know; "" when it does what it should."""
         if self.source == "none":
             return ""
-        return self.problem if self.disagrees or not self.metric else ""
+        return self.problem if self.disagrees or self.kept or not self.metric else ""
 
     def described(self) -> dict[str, str]:
         """Name and value of everything that is known, as texts."""
@@ -94,6 +96,7 @@ class ScaleInForce:
         values["points"] = str(self.points)
         values["disagrees"] = str(self.disagrees).lower()
         values["recalibrations"] = str(self.recalibrations)
+        values["kept over a reset"] = str(self.kept).lower()
         if self.problem:
             values["problem"] = self.problem
         return values
@@ -102,17 +105,17 @@ class ScaleInForce:
 class MetricScale:
     """The scale of one stream over time.
 
-    A reset of the stream begins a new unit, so it ends a calibration found from measurements;
-    a fixed scale stays.
+    A reset of the stream begins a new unit, so it ends a calibration found from measurements. Its
+    scale is kept, less certain, until the next one, or forgotten; a fixed scale stays.
     """
 
     def __init__(self, options: ScaleOptions | None = None) -> None:
         self.options = options or ScaleOptions()
         self.calibrator = ScaleCalibrator(self.options.calibration)
 
-    def reset(self) -> None:
-        """The stream was reset."""
-        self.calibrator.reset()
+    def reset(self, keep: bool = False) -> None:
+        """The stream was reset. keep: see ScaleCalibrator.reset."""
+        self.calibrator.reset(keep)
 
     def push(
         self, view: DepthView, stamp: float, references: Sequence[Reference] = ()
@@ -137,6 +140,8 @@ class MetricScale:
         if source == "fixed":
             return ScaleInForce(source, MetricMap(self.options.metric_scale), 0.0, 0.0)
         state = self.calibrator.state
+        if state.map is None and state.prior is not None:
+            return _kept(source, state.prior, state.problem)
         if state.map is None:
             return ScaleInForce(source, problem=state.problem or "no measurement yet")
         age = math.nan if state.stamp is None else max(now - state.stamp, 0.0)
@@ -150,6 +155,18 @@ class MetricScale:
             state.recalibrations,
             state.problem,
         )
+
+
+def _kept(source: str, prior: ScalePrior, problem: str) -> ScaleInForce:
+    reason = problem or "no measurement since"
+    return ScaleInForce(
+        source,
+        prior.map,
+        prior.spread,
+        points=prior.points,
+        problem=f"kept from before a reset: {reason}",
+        kept=True,
+    )
 
 
 def to_metres(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,11 +19,14 @@ class FilterOptions:
         drift: random walk of the stream's log scale, per square root of a second.
         deviation: standard deviation of a frame's deviation from it.
         seconds: time in which a deviation falls to 1 / e.
+        another_stream: standard deviation between the log scales of two streams of one camera,
+            for what is known of the scale after a reset.
     """
 
     drift: float = 0.009
     deviation: float = 0.25
     seconds: float = 1.0
+    another_stream: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -33,12 +36,12 @@ class FilterState:
     Attributes:
         mean: 2, of the stream's log scale and of the frame's deviation from it.
         covariance: 2 x 2, of the same.
-        stamp: seconds.
+        stamp: seconds; None when the time since then is unknown.
     """
 
     mean: np.ndarray
     covariance: np.ndarray
-    stamp: float
+    stamp: float | None
 
     @property
     def log_scale(self) -> float:
@@ -59,13 +62,26 @@ def predict(state: FilterState, stamp: float, options: FilterOptions) -> FilterS
         stamp: seconds; an earlier one than the state's counts as the state's.
         options: see FilterOptions.
     """
-    elapsed = max(stamp - state.stamp, 0.0)
+    before = stamp if state.stamp is None else state.stamp
+    elapsed = max(stamp - before, 0.0)
     keep = math.exp(-elapsed / options.seconds)
     step = np.diag([1.0, keep])
     covariance = step @ state.covariance @ step
     covariance[0, 0] += options.drift**2 * elapsed
     covariance[1, 1] += options.deviation**2 * (1 - keep**2)
-    return FilterState(step @ state.mean, covariance, max(stamp, state.stamp))
+    return FilterState(step @ state.mean, covariance, max(stamp, before))
+
+
+def restarted(state: FilterState, options: FilterOptions) -> FilterState:
+    """What is known after the stream was reset: the slow scale, less certain, and no deviation.
+
+    Args:
+        state: before the reset; it is not changed.
+        options: see FilterOptions.
+    """
+    slow = float(state.covariance[0, 0]) + options.another_stream**2
+    covariance = np.diag([slow, options.deviation**2])
+    return replace(state, mean=np.array([state.mean[0], 0.0]), covariance=covariance, stamp=None)
 
 
 def update(

@@ -60,6 +60,11 @@ class MetricStage(StreamStage):
         self.scale: ScaleInForce = self._metric.in_force(0.0)  # at the last frame
 
     @property
+    def metres_per_unit(self) -> float | None:
+        """1 when depth is in metres: what this stage gives is the unit; else None."""
+        return 1.0 if self.scale.metric else None
+
+    @property
     def state(self) -> ScaleCalibration:
         """See StreamStage."""
         return self._metric.calibrator.state
@@ -75,8 +80,8 @@ class MetricStage(StreamStage):
         self._pairing.put(stamp, reference)
 
     def started(self, reason: str | None) -> None:
-        """A new stream has a unit of its own: calibrations end, a fixed scale stays."""
-        self._metric.reset()
+        """A new stream has a unit of its own: calibrations end or are kept as less certain."""
+        self._metric.reset(self._options().after_reset == "keep")
         if reason in ANOTHER_CLOCK:
             self._pairing.clear()
 

@@ -11,8 +11,9 @@ from dyfn_core.stream.resets import TimeRules
 from dyfn_core.stream.scene_cut import THRESHOLD
 
 STREAM, SCALE = "Stream", "Metric scale"
-SOURCES = ("none", "fixed", "reference", "camera_height")
+SOURCES = ("none", "fixed", "reference", "camera_height", "odometry")
 UNTIL_METRIC = ("withhold", "relative")
+AFTER_RESET = ("keep", "withhold")
 
 T = TypeVar("T")
 
@@ -114,7 +115,8 @@ class StreamOptions:
         SCALE,
         "none",
         "Source of metres. none: depth is relative. fixed: metric_scale. reference: measurements "
-        "on `reference`. camera_height: height over the ground.",
+        "on `reference`. camera_height: height over the ground. odometry: poses of the moving "
+        "camera, which also steady the depth.",
         choices=SOURCES,
     )
     metric_scale: float = option(
@@ -131,6 +133,19 @@ class StreamOptions:
         "to scale; the topic's unit changes later.",
         choices=UNTIL_METRIC,
         live=True,
+    )
+    after_reset: str = option(
+        SCALE,
+        "keep",
+        "A measured scale after a reset of the stream. keep: in force, 20% less certain and with a "
+        "warning, until the next measurement. withhold: as before the first measurement.",
+        choices=AFTER_RESET,
+        live=True,
+    )
+    scale_field: bool = option(
+        SCALE,
+        True,
+        "odometry: also mend the shape of the depth by a smooth field of scale.",
     )
     reference_tolerance: float = option(
         SCALE,

@@ -13,6 +13,7 @@ import numpy as np
 from dyfn_core.prediction import DISPARITY, Frame, Prediction
 from dyfn_core.stream.depth_stream import DepthStream, same_camera
 from dyfn_core.stream.metric_stage import MetricStage
+from dyfn_core.stream.motion_stage import MotionStage
 from dyfn_core.stream.options import StreamOptions, options_of
 from dyfn_core.stream.resets import (
     FAILED,
@@ -93,7 +94,9 @@ class StreamSession:
                 f"metric_source is {options.metric_source!r}, but the model predicts disparity, "
                 "whose unknown shift no metric scale undoes; expected 'none'"
             )
-        self._metric = MetricStage(lambda: self._options)
+        by_motion = options.metric_source == MotionStage.source
+        metric = MotionStage if by_motion else MetricStage
+        self._metric = metric(lambda: self._options)
         cuts = SceneCutStage(lambda: self._options.scene_cut_threshold)
         self.stages: tuple[StreamStage, ...] = (cuts, self._metric, *stages)
         self.resets: Counter[str] = Counter()
@@ -128,6 +131,12 @@ class StreamSession:
     def unused_references(self) -> Counter[str]:
         """How many measurements, or points of them, were not used, by reason."""
         return self._metric.unused
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Of the unit that the whole stream keeps; None before its metres are known, see
+        Prediction.unit."""
+        return self._metric.metres_per_unit
 
     # Any thread.
 

@@ -16,9 +16,14 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from dyfn_core.files import finished_file
-from dyfn_core.metric.calibration import ScaleCalibration
+from dyfn_core.geometry.tracks import TrackerState, Tracks
+from dyfn_core.metric.calibration import ScaleCalibration, ScalePrior
 from dyfn_core.metric.fit import MetricMap
+from dyfn_core.metric.motion import MotionState, View
+from dyfn_core.metric.motion_scale import MotionScaleState
+from dyfn_core.metric.point_memory import PointMemory
 from dyfn_core.metric.references import Evidence
+from dyfn_core.metric.scale_filter import FilterState
 from dyfn_core.prediction import StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, StreamMemory
 from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
@@ -36,7 +41,8 @@ class SavedStream:
     """What a state file holds.
 
     memory: the DepthStream's. camera_matrix: 3 x 3 float64 pixels, or None.
-    calibration: of the metric scale; cut: of the scene cut detector; None when there is none.
+    calibration: of the metric scale; cut: of the scene cut detector; motion: of the scale from the
+    camera's motion; None when there is none.
     options: what the stream was made with. notes: the caller's own, text to text.
     """
 
@@ -44,6 +50,7 @@ class SavedStream:
     camera_matrix: np.ndarray | None
     calibration: ScaleCalibration | None = None
     cut: CutState | None = None
+    motion: MotionScaleState | None = None
     options: dict[str, Any] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
 
@@ -59,6 +66,14 @@ _KINDS: dict[str, type] = {
     "Evidence": Evidence,
     "CutState": CutState,
     "Look": PictureFeatures,
+    "ScalePrior": ScalePrior,
+    "MotionScaleState": MotionScaleState,
+    "MotionState": MotionState,
+    "View": View,
+    "TrackerState": TrackerState,
+    "Tracks": Tracks,
+    "PointMemory": PointMemory,
+    "FilterState": FilterState,
 }
 
 
@@ -81,6 +96,7 @@ def save_stream(
     *,
     calibration: ScaleCalibration | None = None,
     cut: CutState | None = None,
+    motion: MotionScaleState | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
     """Write a stream's state, whole or not at all: an older file stays until then.
@@ -93,6 +109,7 @@ def save_stream(
         stream.camera_matrix,
         calibration,
         cut,
+        motion,
         stream_options(stream),
         dict(notes or {}),
     )

@@ -108,7 +108,8 @@ def shrink(
     step = math.ceil(max(shape) / MAX_SIDE)
     grid = (slice(step // 2, None, step),) * 2
     predicted, valid = prediction.aligned_quantity
-    solid = prediction.valid & ~flying_pixels(prediction.depth, prediction.valid, EDGE)
+    known = valid & np.isfinite(prediction.depth) & (prediction.depth > 0)
+    solid = known & ~flying_pixels(prediction.depth, known, EDGE)
     matrix = prediction.camera_matrix.astype(np.float64).copy()
     matrix[:2, 2] -= step // 2
     matrix[:2] /= step

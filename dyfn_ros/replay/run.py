@@ -8,10 +8,12 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.controls import latent_controls, stabilized_by
+from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.threads import computing_threads
 from dyfn_ros.replay.outputs import ReplayOutputs
@@ -110,20 +112,20 @@ def _evaluate(
     )
     with files or nullcontext():
         for one in runner.frames(frames):
-            # Disparity is aligned as such, also where its inverse is too far to be depth.
             score = push_frame(
                 evaluation,
                 reader,
                 one.frame,
-                one.prediction.aligned_quantity,
+                _output(one.prediction),
                 one.stamp,
                 one.latency,
                 one.prediction.metric,
+                one.prediction.aligned_quantity,
             )
             if files is not None:
                 files.write(one.frame, one.prediction, score)
         if files is not None:
-            files.finish(_alignment(evaluation), model.quantity)
+            files.finish(_alignment(evaluation, runner.metres_per_unit), model.quantity)
     for loss, count in runner.losses().items():
         reader.recording.notes.losses[loss] += count
     for warning, count in runner.warnings().items():
@@ -131,13 +133,24 @@ def _evaluate(
     return evaluation
 
 
-def _alignment(evaluation: SequenceEvaluation) -> Alignment | None:
+def _output(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What goes out, H x W, and where. Disparity stays disparity: its inverse may be too far."""
+    if prediction.disparity is not None:
+        return prediction.aligned_quantity
+    return prediction.depth, prediction.valid
+
+
+def _alignment(
+    evaluation: SequenceEvaluation, metres_per_unit: float | None
+) -> Alignment | None:
     """What brings all frames into metres: the truth's alignment, else their own scale."""
     video = evaluation.video()
     if video is not None:
         return Alignment(video.scale, video.shift, evaluation.quantity, metres=True)
-    in_metres = evaluation.metric_frames == evaluation.frames
-    return Alignment(metres=True) if in_metres else None
+    if metres_per_unit is None or not evaluation.metric_frames:
+        return None
+    steady = metres_per_unit != 1.0 or evaluation.metric_frames == evaluation.frames
+    return Alignment(metres_per_unit, metres=True) if steady else None
 
 
 def _variant(

@@ -82,6 +82,11 @@ class StreamRunner:
             )
             yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
 
+    @property
+    def metres_per_unit(self) -> float | None:
+        """See StreamSession.metres_per_unit."""
+        return self._session.metres_per_unit
+
     def finish(self) -> None:
         """Save the state, if that is asked for. Raises StateError."""
         if self._run.save_state:

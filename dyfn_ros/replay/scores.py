@@ -19,6 +19,7 @@ def push_frame(
     stamp: float,
     latency: float,
     metric: bool = False,
+    steady: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> FrameScore:
     """Score one frame.
 
@@ -30,6 +31,7 @@ def push_frame(
         stamp: Seconds.
         latency: Seconds that the prediction took.
         metric: Whether the prediction is in metres.
+        steady: What image and video protocol score, see SequenceEvaluation.push.
 
     Returns:
         The frame's score under the image protocol.
@@ -39,7 +41,13 @@ def push_frame(
     """
     try:
         return evaluation.push(
-            frame.image, *predicted, frame.depth, stamp=stamp, latency=latency, metric=metric
+            frame.image,
+            *predicted,
+            frame.depth,
+            stamp=stamp,
+            latency=latency,
+            metric=metric,
+            steady=steady,
         )
     except ValueError as error:
         raise RecordingError(f"{reader.recording.topics.depth}: {error}") from error
