@@ -225,11 +225,26 @@ class StreamSession:
 
     # The thread that pushes frames.
 
-    def push(self, frame: Frame, asked: ResetRequest | None = None) -> Prediction[np.ndarray]:
+    def push(
+        self,
+        frame: Frame | np.ndarray,
+        stamp: float | None = None,
+        *,
+        camera_matrix: np.ndarray | None = None,
+        pose: np.ndarray | None = None,
+        asked: ResetRequest | None = None,
+    ) -> Prediction[np.ndarray]:
         """The geometry of the next frame.
 
         Args:
-            frame: Its camera_matrix is used for this frame; a different one resets the stream.
+            frame: The image, H x W x 3 uint8 RGB without lens distortion, with the three arguments
+                that follow; or a Frame, which has them in it.
+            stamp: Seconds; None when the source has no clock.
+            camera_matrix: 3 x 3 intrinsics in pixels, used for this frame; a different one resets
+                the stream. None when unknown.
+            pose: T_world_camera by the robot's odometry, for metric_source "odometry": 4 x 4,
+                camera to world, metres, of the optical frame (x right, y down, z forward). The
+                world may be any that stands still. None when unknown.
             asked: What `asked` was when the frame came; None when it comes now.
 
         Returns:
@@ -237,9 +252,13 @@ class StreamSession:
             and why the stream was reset with this frame.
 
         Raises:
-            TypeError, ValueError: A bad image, stamp or camera matrix. The stream resets with the
-                next frame.
+            TypeError, ValueError: A bad image, stamp, camera matrix or pose. The stream resets with
+                the next frame.
         """
+        if not isinstance(frame, Frame):
+            frame = Frame(frame, stamp, camera_matrix, pose=pose)
+        elif stamp is not None or camera_matrix is not None or pose is not None:
+            raise TypeError("stamp, camera_matrix and pose of a Frame are its own")
         try:
             stream = self.begin(frame, asked)
             return self.end(frame, stream.push(frame.image, frame.stamp))

@@ -24,6 +24,7 @@ from dyfn_core.cli.arguments import (
     add_threads,
     command_parser,
 )
+from dyfn_core.metric.odometry_noise import OdometryNoise, parse_noise
 from dyfn_core.quantities import DEPTH, QUANTITIES
 from dyfn_core.stream.options import STREAM, add_options, options_from
 from dyfn_ros.replay.settings import (
@@ -98,7 +99,7 @@ def _check(reader: argparse.ArgumentParser, given: dict[str, Any], run: Run) -> 
     """Refuse contradictions, and name options that have no effect."""
     if given["image_topics"] and given["all_topics"]:
         reader.error("--all-topics does not go with --image-topic")
-    _check_session(reader, given["reference_topic"], run)
+    _check_session(reader, given, run)
     if given["prediction_topic"] is None:
         if given["quantity"] is not None:
             reader.error("--quantity describes --prediction-topic, which is not given")
@@ -118,10 +119,15 @@ def _check(reader: argparse.ArgumentParser, given: dict[str, Any], run: Run) -> 
         print(f"{reader.prog}: warning: {text}", file=sys.stderr)
 
 
-def _check_session(reader: argparse.ArgumentParser, topic: str | None, run: Run) -> None:
+def _check_session(reader: argparse.ArgumentParser, given: dict[str, Any], run: Run) -> None:
     stream, saved = run.stream, run.load_state or run.save_state
-    if topic is not None and stream.metric_source != "reference":
+    if given["reference_topic"] is not None and stream.metric_source != "reference":
         reader.error("--reference-topic has no effect without --metric-source reference")
+    if stream.metric_source != "odometry":
+        for name in ("odometry_topic", "odometry_noise"):
+            if given[name] is not None:
+                option = f"--{name.replace('_', '-')}"
+                reader.error(f"{option} has no effect without --metric-source odometry")
     if saved and not stream.state_file:
         reader.error("--load-state and --save-state need --state-file")
     if stream.state_file and not saved:
@@ -211,6 +217,19 @@ def _add_source(group: Options) -> None:
         metavar="TOPIC",
         help="measurements for --metric-source reference (default: found by --reference-type)",
     )
+    add(
+        "--odometry-topic",
+        metavar="TOPIC",
+        help="poses, odometry or TF for --metric-source odometry (default: found by type; "
+        "poses.txt of a folder)",
+    )
+    add(
+        "--odometry-noise",
+        type=_noise,
+        metavar="SCALE,DISTANCE,ROTATION,SEED",
+        help="for tests: errors added to these poses, such as 0.02,0.01,0.2,0: scale, random walk "
+        "of the distance, degrees per square root of a metre (default: none)",
+    )
     add_stride(group)
     add_max_frames(group)
 
@@ -292,6 +311,13 @@ def _add_batch(group: Options) -> None:
         metavar="ADDRESS",
         help='send the recordings to this Ray cluster; "local" makes one on this machine',
     )
+
+
+def _noise(text: str) -> OdometryNoise:
+    try:
+        return parse_noise(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _outputs(text: str) -> tuple[str, ...]:

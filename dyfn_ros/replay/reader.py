@@ -15,6 +15,7 @@ from dyfn_ros.recordings.frames import RecordedFrame
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.reference_topic import ReferenceTopic
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording
+from dyfn_ros.replay.pose_feed import PoseFeed
 from dyfn_ros.replay.settings import SessionOptions, Source
 
 
@@ -109,6 +110,20 @@ class SourceReader:
 
         is_truth = topic.name == self.recording.topics.depth
         return ReferenceFeed(topic, message_references(options, unreadable), is_truth)
+
+    def poses(self, options: SessionOptions) -> PoseFeed | None:
+        """The camera's poses, from the first frame on.
+
+        Args:
+            options: Whether they are wanted.
+
+        Returns:
+            None when the metric source is not odometry.
+        """
+        if options.metric_source != "odometry":
+            return None
+        source = self._source
+        return PoseFeed(source.recording, source.odometry_topic, source.odometry_noise)
 
     def warn(self, reason: str, times: int = 1) -> None:
         """Note data that is there but could not be used."""

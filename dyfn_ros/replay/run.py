@@ -61,7 +61,7 @@ def replay(
     model = loader(run.model, run.device)
     stabilized = run.stream.stabilize and model.stabilizer is not None
     with computing_threads(run.threads) as threads:
-        runner = StreamRunner(run, model, reader.references(run.stream))
+        runner = _runner(reader, run, model)
         files = ReplayOutputs(outputs, source.recording, reader.warn)
         evaluation = _evaluate(reader, runner, model, outputs, files)
         reader.require(evaluation.frames)
@@ -92,6 +92,10 @@ def stream_facts(run: Run) -> dict[str, Any]:
         "reference_transform": run.stream.reference_transform or None,
         "device": run.device,
     }
+
+
+def _runner(reader: SourceReader, run: Run, model: GeometryModel) -> StreamRunner:
+    return StreamRunner(run, model, reader.references(run.stream), reader.poses(run.stream))
 
 
 def _evaluate(
@@ -140,9 +144,7 @@ def _output(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     return prediction.depth, prediction.valid
 
 
-def _alignment(
-    evaluation: SequenceEvaluation, metres_per_unit: float | None
-) -> Alignment | None:
+def _alignment(evaluation: SequenceEvaluation, metres_per_unit: float | None) -> Alignment | None:
     """What brings all frames into metres: the truth's alignment, else their own scale."""
     video = evaluation.video()
     if video is not None:
@@ -158,7 +160,7 @@ def _variant(
 ) -> SequenceEvaluation:
     """The same frames in another run; nothing but its evaluation is kept."""
     reader = SourceReader(source)
-    runner = StreamRunner(run, model, reader.references(run.stream))
+    runner = _runner(reader, run, model)
     return _evaluate(reader, runner, model, outputs)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.session import StreamSession
 from dyfn_ros.recordings.frames import RecordedFrame
+from dyfn_ros.replay.pose_feed import PoseFeed
 from dyfn_ros.replay.reader import ReferenceFeed
 from dyfn_ros.replay.settings import Run
 
@@ -40,18 +41,25 @@ class RunFrame:
 class StreamRunner:
     """One stream session over the frames of a recording."""
 
-    def __init__(self, run: Run, model: GeometryModel, references: ReferenceFeed | None) -> None:
+    def __init__(
+        self,
+        run: Run,
+        model: GeometryModel,
+        references: ReferenceFeed | None,
+        poses: PoseFeed | None = None,
+    ) -> None:
         """Start the session; a saved state is loaded.
 
         Args:
             run: The options.
             model: As load_model returns it.
             references: Measurements for the metric scale; None: there are none.
+            poses: Of the camera; None: unknown.
 
         Raises:
             ValueError: An option is wrong, or the state does not fit (StateError).
         """
-        self._run, self._references = run, references
+        self._run, self._references, self._poses = run, references, poses
         self._session = StreamSession(model, run.stream)
         self._state: dict[str, str] = {}
         if run.save_state:
@@ -75,11 +83,15 @@ class StreamRunner:
             if self._references is not None:
                 for when, reference in self._references.before(frame):
                     self._session.add_reference(when, reference)
-            prediction = self._session.push(
-                Frame(
-                    frame.image, stamp, frame.camera_matrix, frame.visible, frame_id=frame.frame_id
-                )
+            pushed = Frame(
+                frame.image,
+                stamp,
+                frame.camera_matrix,
+                frame.visible,
+                frame.frame_id,
+                None if self._poses is None else self._poses.pose(frame),
             )
+            prediction = self._session.push(pushed)
             yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
 
     @property
@@ -102,6 +114,9 @@ class StreamRunner:
     def warnings(self) -> dict[str, int]:
         """What a user should look at, with how often."""
         found = dict.fromkeys(self._session.problems(), 1)
+        if self._poses is not None:
+            for reason, count in sorted(self._session.unused_references.items()):
+                found[f"odometry: frames without points: {reason}"] = count
         if self._references is None:
             return found
         topic = self._references.topic.name

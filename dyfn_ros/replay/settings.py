@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from dyfn_core.metric.odometry_noise import OdometryNoise
 from dyfn_core.quantities import DEPTH
 from dyfn_core.stream.options import StreamOptions
 from dyfn_core.threads import THREADS
@@ -36,6 +37,8 @@ class Source:
         depth_info_topic: CameraInfo of a depth camera that is not the image's.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
+        odometry_topic: Poses for metric_source "odometry", see recordings.poses.open_poses.
+        odometry_noise: Errors that are added to them; None: none.
         stamps: Times of the headers, or of the log.
         tolerance: Seconds between the stamps of an image and its ground truth.
         stride: Every N-th frame is read.
@@ -49,6 +52,8 @@ class Source:
     depth_info_topic: str | None = None
     depth_transform: str | None = None
     reference_topic: str | None = None
+    odometry_topic: str | None = None
+    odometry_noise: OdometryNoise | None = None
     stamps: Literal["header", "log"] = "header"
     tolerance: float = 0.02
     stride: int = 1
@@ -85,12 +90,26 @@ class Run:
     controls: bool = False
 
     def without_dyfn(self) -> Run:
-        """The same run of the base model; a saved state is DyFN's and stays out of it."""
-        return self._variant(stabilize=False)
+        """The same run of the base model; a saved state is DyFN's and stays out of it.
+
+        Odometry steadies the depth too, so the base goes without it.
+        """
+        return self._variant(stabilize=False)._without_odometry()
+
+    def without_odometry(self) -> Run | None:
+        """The same run in the model's own unit, without a saved state; None when it is that."""
+        if self.stream.metric_source != "odometry":
+            return None
+        return self._variant(self.stream.stabilize)._without_odometry()
 
     def with_dyfn(self) -> Run:
         """The same run with DyFN, or what stands in its place, and without a saved state."""
         return self._variant(stabilize=True)
+
+    def _without_odometry(self) -> Run:
+        if self.stream.metric_source != "odometry":
+            return self
+        return replace(self, stream=replace(self.stream, metric_source="none"))
 
     def _variant(self, stabilize: bool) -> Run:
         stream = replace(self.stream, stabilize=stabilize)

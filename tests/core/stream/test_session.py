@@ -14,6 +14,7 @@ from dyfn_core.metric.calibration import FITS, MODES, CalibrationOptions
 from dyfn_core.metric.scale import SOURCES, ScaleOptions
 from dyfn_core.prediction import DISPARITY, Frame, Prediction
 from dyfn_core.stream.metric_stage import scale_options
+from dyfn_core.stream.motion_stage import MotionStage
 from dyfn_core.stream.options import StreamOptions, add_options, options_from, options_of
 from dyfn_core.stream.resets import (
     BACKWARDS,
@@ -43,7 +44,7 @@ def seen(
     found = []
     for index, frame in enumerate(frames):
         request = None if asked is None else asked[index]
-        one = session.push(Frame(**{"image": IMAGE, **frame}), request)
+        one = session.push(Frame(**{"image": IMAGE, **frame}), asked=request)
         assert session.stream is not None
         found.append((session.stream.memory.frames, one.reset))
     return found
@@ -255,7 +256,7 @@ def test_the_scale_is_found_with_the_library_s_defaults() -> None:
     assert scale_options(StreamOptions()) == ScaleOptions()
     assert ScaleOptions().calibration == CalibrationOptions()
     described = options_of(StreamOptions)
-    assert described["metric_source"].choices == SOURCES
+    assert described["metric_source"].choices == (*SOURCES, MotionStage.source)
     assert described["calibration"].choices == MODES
     assert described["calibration_fit"].choices == FITS
 

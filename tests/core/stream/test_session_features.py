@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,7 @@ def test_a_scene_cut_resets_the_stream_and_is_off_at_zero() -> None:
     assert session.stream.memory.frames == 2
 
 
-def test_reference_gives_metres_after_its_first_second_until_the_next_reset() -> None:
+def test_reference_gives_metres_after_its_first_second_and_over_a_reset() -> None:
     session = session_of(metric_source="reference", scene_cut_threshold=0.0)
     relative = session_of(scene_cut_threshold=0.0)
     for step in range(13):
@@ -57,8 +58,14 @@ def test_reference_gives_metres_after_its_first_second_until_the_next_reset() ->
     np.testing.assert_allclose(found.depth[found.valid], 3 * plain.depth[found.valid], rtol=0.05)
     assert session.scale.map.scale == pytest.approx(3, rel=0.05)
     assert session.report()["scale: unit"] == "metres"
+    certain = session.scale.spread
     session.request_reset()
-    assert not push(session, picture(0), 6.3).metric
+    assert push(session, picture(0), 6.3).metric
+    assert session.scale.spread == pytest.approx(np.hypot(certain, 0.2))
+    assert session.problems() == ["scale: kept from before a reset: no measurement since"]
+    session.options = replace(session.options, after_reset="withhold")
+    session.request_reset()
+    assert not push(session, picture(0), 6.4).metric
     assert "no measurement yet" in session.problems()[0]
 
 
@@ -118,7 +125,7 @@ def test_a_frame_from_before_the_load_does_not_touch_the_loaded_state(tmp_path: 
     expected = push(session, picture(1), 0.1).depth
     before = session.asked
     session.load(str(tmp_path / "s"))
-    session.push(Frame(picture(2), 0.2), before)
+    session.push(Frame(picture(2), 0.2), asked=before)
     np.testing.assert_array_equal(push(session, picture(1), 0.3).depth, expected)
 
 

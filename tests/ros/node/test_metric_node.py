@@ -94,7 +94,7 @@ def value(bench: Bench, key: str) -> str:
 
 
 def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
-    """Withheld at first, metres after the calibration, withheld again after a reset."""
+    """Withheld at first, metres after the calibration, kept or withheld after a reset."""
     client = bench.start(
         metric_source="reference",
         calibration_seconds=2.0,
@@ -138,7 +138,13 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
     assert int(value(bench, "points")) >= 10
     assert math.isfinite(float(value(bench, "spread")))
 
+    client.reset()
+    np.testing.assert_allclose(depth_of(client.result(client.send(picture))), metric, rtol=0.1)
+    client.wait(lambda: bench.statuses[-1].level == DiagnosticStatus.WARN)
+    assert "kept from before a reset" in bench.statuses[-1].message
+
     assert client.set_parameter("until_metric", "withhold").successful
+    assert client.set_parameter("after_reset", "withhold").successful
     client.reset()
     assert np.isnan(depth_of(client.result(client.send(picture)))).all()
 
