@@ -33,7 +33,7 @@ from dyfn_core.evaluation.benchmarks.registry import (
     find_layout,
     open_benchmark,
 )
-from dyfn_core.evaluation.benchmarks.report import write_benchmark_report
+from dyfn_core.evaluation.benchmarks.report import role, write_benchmark_report
 from dyfn_core.evaluation.benchmarks.run import Scoring, evaluate
 from dyfn_core.evaluation.benchmarks.table import write_json, write_results
 from dyfn_core.evaluation.report.html import text_table
@@ -140,7 +140,9 @@ def _scoring(options: argparse.Namespace, temporal: bool) -> Scoring:
 def _evaluate(options: argparse.Namespace) -> int:
     opened = _open(options)
     method = _method(options)
-    pictures = BenchmarkPictures([one.name for one in opened.sequences], method.quantity)
+    names = [one.name for one in opened.sequences]
+    shown = [name for name in method.variants if role(name) != "control"]
+    pictures = BenchmarkPictures(names, method.quantity, method.variants, shown)
     results = evaluate(
         opened,
         method,

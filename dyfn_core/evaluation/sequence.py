@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.evaluation.report.frame_grid import FrameStrip, ShownFrames
 from dyfn_core.evaluation.report.html import Cell, Table
-from dyfn_core.evaluation.report.pictures import FrameStrip, curves
+from dyfn_core.evaluation.report.pictures import curves
+from dyfn_core.evaluation.report.variants import over_median
 from dyfn_core.evaluation.report.worst_frames import WorstFrames
 from dyfn_core.prediction import DEPTH
 from dyfn_core.scoring.frame_scores import FrameScore, MetricRows
@@ -216,10 +218,22 @@ class SequenceEvaluation:
                 for name, value in zip(names, values, strict=True)
             }
 
-    def draw_strip(self) -> np.ndarray:
-        """The strip, aligned as the video protocol does (H x W x 3 uint8 RGB)."""
+    @property
+    def in_metres(self) -> bool:
+        """Whether every frame was in metres."""
+        return 0 < self.metric_frames == self.frames
+
+    def shown_frames(self) -> ShownFrames:
+        """The strip's frames: in metres as they are, else aligned as the video protocol does."""
         video = self.video()
-        return self.strip.draw(1, 0) if video is None else self.strip.draw(video.scale, video.shift)
+        if video is None or self.in_metres:
+            return self.strip.shown()
+        return self.strip.shown(video.scale, video.shift)
+
+    def draw_strip(self) -> np.ndarray:
+        """The strip of shown_frames (H x W x 3 uint8 RGB)."""
+        shown = self.shown_frames()
+        return self.strip.draw(shown.scale, shown.shift)
 
 
 def latency_marks(milliseconds: np.ndarray) -> dict[str, float] | None:
@@ -242,11 +256,10 @@ def _coverage(scorer: SequenceScorer) -> float | None:
 def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
     """Runs (name -> results()) and, below, the controls of the first, as one table.
 
-    The metric protocol has columns where a run was in metres.
+    Columns that no run has (without truth, not in metres) are left out, and so are controls
+    without a score.
     """
-    protocols = ["image", "video"]
-    if any("metric" in result for result in results.values()):
-        protocols.append("metric")
+    protocols = ("image", "video", "metric")
     scores = [text for name in protocols for text in (f"{name} AbsRel", "delta1")]
     rows: list[list[Cell]] = []
     for name, result in results.items():
@@ -254,9 +267,12 @@ def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
         latency = result["latency_ms"] or {}
         p50 = latency.get("p50")
         rows.append([name, *_scores(result, protocols), wandering, _one_digit(p50)])
-    for name, control in next(iter(results.values()))["controls"].items():
-        rows.append([f"control: {name}", *_scores(control, protocols), None, None])
-    return Table(("", *scores, "scale spread", "p50 ms"), rows)
+    controls = {f"control: {n}": c for n, c in next(iter(results.values()))["controls"].items()}
+    scored = {name: _scores(control, protocols) for name, control in controls.items()}
+    rows += [[n, *s, None, None] for n, s in scored.items() if s != [None] * len(s)]
+    header = ("", *scores, "scale spread", "p50 ms")
+    kept = [i for i in range(len(header)) if any(row[i] is not None for row in rows)]
+    return Table([header[i] for i in kept], [[row[i] for i in kept] for row in rows], [*scored])
 
 
 def _one_digit(value: float | None) -> str | None:
@@ -280,9 +296,3 @@ def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:
             },
         }
     )
-
-
-def over_median(values: np.ndarray) -> np.ndarray:
-    """Values over the median of those that are not NaN; all NaN when that is 0 or nothing is."""
-    middle = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
-    return values / middle if middle else np.full(len(values), np.nan)

@@ -185,7 +185,7 @@ def _write(options: DemoOptions, recording: Recording, runs: dict[str, DemoRun])
     table = score_table(results)
     strips = {name: evaluation.draw_strip() for name, evaluation in evaluations.items()}
     clouds = {name: run.clouds for name, run in runs.items()}
-    sections = sequence_sections(evaluations, clouds, LATENCY_NOTE)
+    sections = sequence_sections(evaluations, clouds, LATENCY_NOTE, base=[*RUNS][1])
     if all(result["image"] is not None for result in results.values()):
         (out / "curves.png").write_bytes(encode_picture(curve_picture(evaluations)))
     for name, stabilize in RUNS.items():

@@ -131,12 +131,13 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     ]
     notes = recording["losses"] | recording["warnings"]
     name = run_name(metrics)
-    runs = {name: result.evaluation}
+    runs, base = {name: result.evaluation}, None
     if result.base is not None:
-        runs[run_name({**metrics, "stabilizer": False})] = result.base
+        base = run_name({**metrics, "stabilizer": False})
+        runs[base] = result.base
     clouds = {} if result.cloud is None else {f"{name}, fused, from above": result.cloud}
     controlled = result.evaluation.controls.keys() > CONTROLS.keys()
-    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if controlled else "")
+    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if controlled else "", base=base)
     if notes:
         rows = [[text, count] for text, count in notes.items()]
         sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))

@@ -17,6 +17,8 @@ from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DISPARITY, Prediction
 from dyfn_core.stream.depth_stream import DepthStream
 
+BASE = ", base"  # ends the name of the variant without DyFN
+
 
 class ModelMethod:
     """predictions.Method of a model: with DyFN, without, and with the statistics controls.
@@ -44,7 +46,7 @@ class ModelMethod:
         self._stabilizers: dict[str, DyFN | None] = {}
         if stabilize and model.stabilizer is not None:
             self._stabilizers[f"{name} + DyFN"] = model.stabilizer
-        self._stabilizers[f"{name}, base"] = None
+        self._stabilizers[name + BASE] = None
         if controls:
             found = latent_controls(model)
             self._stabilizers |= {f"control: {kind}": found[kind] for kind in found}

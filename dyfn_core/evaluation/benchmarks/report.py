@@ -8,18 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.evaluation.benchmarks.model_method import BASE
 from dyfn_core.evaluation.benchmarks.pictures import STRIPS, BenchmarkPictures, WorstFrame
 from dyfn_core.evaluation.benchmarks.table import sequence_table
-from dyfn_core.evaluation.report.html import (
-    Cell,
-    Part,
-    ReportPicture,
-    Section,
-    Table,
-    Text,
-    write_report,
-)
-from dyfn_core.evaluation.report.sequence import latency_section, over_time_curves
+from dyfn_core.evaluation.report.html import Cell, Part, Section, Table, Text, write_report
+from dyfn_core.evaluation.report.sequence import latency_section
+from dyfn_core.evaluation.report.variants import Role, Variant, headline, key_figures, over_time
 
 NOTE = (
     "Image: each frame aligned to the truth by its own scale and shift; video: one scale and shift "
@@ -27,8 +21,9 @@ NOTE = (
     "latent's statistics as a moving average (ema) and those of the first frame (frozen)."
 )
 PICTURE_NOTE = (
-    "Pictures are of the first method in the table, aligned by its sequence's one scale and shift "
-    f"(video), evenly spaced frames; of more than {STRIPS} sequences, {STRIPS} evenly spaced ones."
+    "Depth in pictures is aligned by its sequence's one scale and shift (video), so that drift "
+    f"shows; evenly spaced frames; of more than {STRIPS} sequences, {STRIPS} evenly spaced ones. "
+    "Worst frames are of the first method in the table."
 )
 WORST_NOTE = (
     "By AbsRel under the video protocol over all sequences, one of each 24th of a sequence. "
@@ -50,20 +45,25 @@ def write_benchmark_report(
 
     pictures: those that evaluate() took. seconds: of every frame by variant, see Method.
     """
-    sections = [Section("Scores", [table, Text(NOTE, note=True), Text(PICTURE_NOTE, note=True)])]
+    times = {name: np.array(values) * 1000 for name, values in seconds.items() if len(values)}
+    variants = _variants(results)
+    notes = [Text(NOTE, note=True), Text(PICTURE_NOTE, note=True)]
+    sections = [
+        Section("At a glance", [Text(headline(variants), lead=True), key_figures(variants)]),
+        Section("Scores", [_shown_table(table, metres=not times), *notes]),
+    ]
     if results["missing"]:
         rows = [[name] for name in results["missing"]]
         sections.append(Section("Not scored", [Table(("sequence",), rows)]))
     for found in results["sequences"]:
         name = found["name"]
-        parts = _curves(found)
+        parts = over_time(_sequence_variants(found))
         if name in pictures.strips:
-            parts.insert(0, ReportPicture(pictures.strips[name], f"some frames of {name}"))
+            parts.insert(0, pictures.strips[name])
         sections.append(Section(f"Over time, {name}", parts))
     sections += _worst(pictures.worst)
-    times = {name: np.array(values) * 1000 for name, values in seconds.items() if len(values)}
     sections += [latency_section(times)] if times else []
-    sections.append(Section("By sequence", [sequence_table(results)]))
+    sections.append(Section("By sequence", [_shown_table(sequence_table(results))]))
     facts = {**results.get("options", {}), **results["settings"], **results["versions"]}
     facts_table = Table(("", ""), [[name, str(value)] for name, value in facts.items()])
     sections.append(Section("What was run", [facts_table]))
@@ -85,15 +85,46 @@ def _worst(worst: Sequence[WorstFrame]) -> list[Section]:
     ]
     header = ("worst first", "frame", "number", "AbsRel", "picture")
     parts: list[Part] = [Table(header, rows)]
-    shown = [found.picture for found in worst if found.picture is not None]
-    if shown:
-        parts.append(ReportPicture(np.vstack(shown), "worst frames, worst first"))
+    parts += [found.picture for found in worst if found.picture is not None]
     return [Section("Worst frames", [*parts, Text(WORST_NOTE, note=True)])]
 
 
-def _curves(sequence: dict[str, Any]) -> list[Part]:
-    def lines(column: str) -> dict[str, np.ndarray]:
-        found = sequence["over_time"].items()
-        return {name: np.array(columns[column], np.float64) for name, columns in found}
+def role(variant: str) -> Role:
+    """What a variant of a method, or a control, is in the report."""
+    if variant.startswith("control: "):
+        return "control"
+    return "base" if variant.endswith(BASE) else "result"
 
-    return over_time_curves(lines("scale"), lines("shift"), lines("video_abs_rel"))
+
+def _variants(results: dict[str, Any]) -> list[Variant]:
+    """The means over all sequences. Without DyFN the base is what the report is about."""
+    names = results["variants"]
+    alone = all(role(name) != "result" for name in names)
+    found = []
+    for name, scores in names.items():
+        shown = {key: scores[key] for key in ("video", "spread")}
+        kind = "result" if alone and role(name) == "base" else role(name)
+        found.append(Variant(name, kind, {**shown, "frames": results["frames"]}))
+    return found
+
+
+def _sequence_variants(sequence: dict[str, Any]) -> list[Variant]:
+    return [
+        Variant(name, role(name), {}, {c: np.array(v, np.float64) for c, v in columns.items()})
+        for name, columns in sequence["over_time"].items()
+    ]
+
+
+def _shown_table(table: Table, metres: bool = True) -> Table:
+    """Without columns that are empty; controls grey. metres: False leaves the metric protocol out,
+    for depth that no model says to be in metres."""
+    header = [*table.header]
+    kept = [
+        column
+        for column, name in enumerate(header)
+        if any(row[column] is not None for row in table.rows)
+        and (metres or not name.startswith("metric "))
+    ]
+    rows = [[row[column] for column in kept] for row in table.rows]
+    muted = {str(cell) for row in rows for cell in row[:2] if role(str(cell)) == "control"}
+    return Table([header[column] for column in kept], rows, muted)

@@ -76,7 +76,8 @@ def score_sequence(
                 }
             )
     if pictures is not None and taken is not None:
-        pictures.finish(taken, scorers.first.video())
+        videos = {name: scorers.scorers[name].video() for name in scorers.variants}
+        pictures.finish(taken, videos)
     for name, found in variants.items():
         found["temporal"] = steadiness.get(name)
     return {
@@ -110,8 +111,7 @@ def _push_all(
         if temporal is not None:
             temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
         if taken is not None:
-            predicted = maps[scorers.variants[0]]
-            taken.add(count - 1, frame.image, predicted, truth, scorers.first.frames[-1])
+            taken.add(count - 1, frame.image, maps, truth, scorers.first.frames[-1])
     return count
 
 

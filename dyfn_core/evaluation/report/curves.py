@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-WIDTH, HEIGHT = 860, 210
-LEFT, RIGHT, TOP, BOTTOM = 62, 850, 8, 182
+WIDTH, HEIGHT = 860, 236
+LEFT, RIGHT, TOP, BOTTOM = 66, 850, 24, 196
 BUCKETS = 400  # of a long curve; each keeps its lowest and its highest value
 BARS = 40
 COLOURS = 6
+MUTED = "var(--muted)"
+DASHES = ("", "6 3", "2 3", "10 3 2 3")
+CLIP = (
+    '<svg class="defs" width="0" height="0"><clipPath id="plot"><rect '
+    f'x="{LEFT}" y="{TOP}" width="{RIGHT - LEFT}" height="{BOTTOM - TOP}"/></clipPath></svg>'
+)
 Point = tuple[int, float]
+Place = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Curves:
-    """Lines over the frames. lines: name -> a value per frame, None (or not finite) for a gap."""
+    """Lines over the frames.
+
+    lines: name -> a value per frame, None (or not finite) for a gap. x: where each frame stands,
+    in the unit of x_label and never falling; None: frames are counted. y_label: quantity and unit.
+    muted: names of lines that are drawn grey and do not stretch the axis.
+    """
 
     title: str
     lines: Mapping[str, Sequence[float | None] | np.ndarray]
     x_label: str = "frame"
+    y_label: str = ""
+    x: Sequence[float] | np.ndarray | None = None
+    muted: Collection[str] = ()
 
 
 @dataclass(frozen=True)
@@ -62,30 +77,60 @@ def decimate(
 
 def curves_html(part: Curves) -> str:
     """A figure; the data for the script is inside."""
-    lines = {name: decimate(values) for name, values in part.lines.items()}
-    points = [point for runs in lines.values() for run in runs for point in run]
-    last = max([len(values) for values in part.lines.values()] or [1]) - 1
-    low, high = _range([value for _, value in points])
-    drawn = [_frame(0, max(last, 1), low, high)]
-    for number, runs in enumerate(lines.values()):
-        path = "".join(_path(run, last, low, high) for run in runs)
-        drawn.append(f'<path class="plot" stroke="{_colour(number)}" d="{path}"/>')
+    count = max([len(values) for values in part.lines.values()] or [1])
+    places = np.arange(count) if part.x is None else np.asarray(part.x, np.float64)
+    lines = {
+        name: [[(float(places[at]), value) for at, value in run] for run in decimate(values)]
+        for name, values in part.lines.items()
+    }
+    shown = [name for name in lines if name not in part.muted] or list(lines)
+    low, high = _range([value for name in shown for run in lines[name] for _, value in run])
+    start, end = _ends(places)
+    drawn = [_frame(start, end, low, high, integral=part.x is None)]
+    colours = line_colours(part.lines, part.muted)
+    dashes = _dashes(lines, part.muted)
+    for name in sorted(lines, key=lambda name: name not in part.muted):  # grey lies below
+        path = "".join(_path(run, (start, end), (low, high)) for run in lines[name])
+        drawn.append(
+            f'<path class="plot" clip-path="url(#plot)" stroke="{colours[name]}" '
+            f'stroke-dasharray="{dashes[name]}" d="{path}"/>'
+        )
     drawn.append(f'<line class="cursor" y1="{TOP}" y2="{BOTTOM}"/>')
     data = {
         "label": part.x_label,
-        "last": max(last, 0),
+        "ends": [start, end],
         "box": {"left": LEFT, "right": RIGHT, "width": WIDTH},
         "lines": [
-            {"name": name, "points": [[x, float(f"{y:.4g}")] for run in runs for x, y in run]}
+            {"name": name, "points": [[_short(x), _short(y)] for run in runs for x, y in run]}
             for name, runs in lines.items()
         ],
     }
     packed = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f"<figure data-curve><figcaption>{escape(part.title)}</figcaption>{_legend(part.lines)}"
-        f"{_svg(drawn, part.title, part.x_label)}"
+        f"<figure data-curve><figcaption>{escape(part.title)}</figcaption>"
+        f"{_legend(colours, dashes)}{_svg(drawn, part.title, part.x_label, part.y_label)}"
         f'<div class="tip"></div><script type="application/json">{packed}</script></figure>'
     )
+
+
+def line_colours(names: Iterable[str], muted: Collection[str] = ()) -> dict[str, str]:
+    """The colour of each line, as CSS: its place among those that are not muted, else grey."""
+    found: dict[str, str] = {}
+    for name in names:
+        used = sum(colour != MUTED for colour in found.values())
+        found[name] = MUTED if name in muted else f"var(--c{used % COLOURS})"
+    return found
+
+
+def _ends(places: np.ndarray) -> tuple[float, float]:
+    """First and last place, apart also where there is only one."""
+    first = float(places[0]) if len(places) else 0.0
+    last = float(places[-1]) if len(places) else 0.0
+    return first, last if last > first else first + 1
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.5g}")
 
 
 def histogram_html(part: Histogram) -> str:
@@ -100,12 +145,13 @@ def histogram_html(part: Histogram) -> str:
     shares = {n: np.histogram(np.minimum(v, high), edges)[0] / len(v) for n, v in values.items()}
     top = max(float(share.max()) for share in shares.values()) * 100
     drawn = [_frame(low, high, 0, top, integral=False)]
+    colours = line_colours(values)
     for number, (name, share) in enumerate(shares.items()):
         steps = "".join(
             f"L{_x(a, low, high)} {_y(s * 100, 0, top)}L{_x(b, low, high)} {_y(s * 100, 0, top)}"
             for a, b, s in zip(edges, edges[1:], share, strict=False)
         )
-        colour = _colour(number)
+        colour = colours[name]
         drawn.append(
             f'<path d="M{LEFT} {BOTTOM}{steps}L{RIGHT} {BOTTOM}Z" fill="{colour}" '
             f'fill-opacity=".25" stroke="{colour}"/>'
@@ -118,29 +164,37 @@ def histogram_html(part: Histogram) -> str:
                 f"{escape(label)}</text>"
             )
     return (
-        f"<figure><figcaption>{escape(part.title)}</figcaption>{_legend(values)}"
-        f"{_svg(drawn, part.title, f'{part.unit} (height: % of the frames)')}</figure>"
+        f"<figure><figcaption>{escape(part.title)}</figcaption>{_legend(colours, {})}"
+        f"{_svg(drawn, part.title, part.unit, '% of the frames')}</figure>"
     )
 
 
-def _svg(drawn: list[str], title: str, x_label: str) -> str:
-    label = f'<text x="{RIGHT}" y="{HEIGHT - 2}" text-anchor="end">{escape(x_label)}</text>'
+def _svg(drawn: list[str], title: str, x_label: str, y_label: str) -> str:
+    labels = (
+        f'<text x="{RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{escape(x_label)}</text>'
+        f'<text x="2" y="15">{escape(y_label)}</text>'
+    )
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title, quote=True)}">'
-        f"{''.join(drawn)}{label}</svg>"
+        f"{''.join(drawn)}{labels}</svg>"
     )
 
 
-def _legend(lines: Mapping[str, object]) -> str:
+def _dashes(names: Iterable[str], muted: Collection[str]) -> dict[str, str]:
+    """Grey lines are told apart by their dashes."""
+    grey = (name for name in names if name in muted)
+    return dict.fromkeys(names, "") | {
+        name: DASHES[number % len(DASHES)] for number, name in enumerate(grey)
+    }
+
+
+def _legend(colours: Mapping[str, str], dashes: Mapping[str, str]) -> str:
     names = "".join(
-        f'<i style="background:{_colour(number)}"></i>{escape(name)}'
-        for number, name in enumerate(lines)
+        f'<span><svg viewBox="0 0 32 4"><path stroke="{colour}" stroke-width="3" '
+        f'stroke-dasharray="{dashes.get(name, "")}" d="M0 2H32"/></svg>{escape(name)}</span>'
+        for name, colour in colours.items()
     )
     return f'<div class="legend">{names}</div>'
-
-
-def _colour(number: int) -> str:
-    return f"var(--c{number % COLOURS})"
 
 
 def _range(values: list[float]) -> tuple[float, float]:
@@ -149,7 +203,7 @@ def _range(values: list[float]) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _frame(x0: float, x1: float, y0: float, y1: float, integral: bool = True) -> str:
+def _frame(x0: float, x1: float, y0: float, y1: float, integral: bool) -> str:
     """Grid lines and the numbers at them."""
     parts = []
     for value in _ticks(y0, y1, 4, False):
@@ -177,8 +231,8 @@ def _y(value: float, low: float, high: float) -> float:
     return round(BOTTOM - (value - low) / (high - low) * (BOTTOM - TOP), 1)
 
 
-def _path(run: list[Point], last: int, low: float, high: float) -> str:
-    places = [f"{_x(x, 0, max(last, 1))} {_y(y, low, high)}" for x, y in run]
+def _path(run: list[Place], ends: tuple[float, float], span: tuple[float, float]) -> str:
+    places = [f"{_x(x, *ends)} {_y(y, *span)}" for x, y in run]
     if len(places) == 1:  # a lone value between gaps: a short stroke
-        places.append(f"{_x(run[0][0], 0, max(last, 1)) + 1} {_y(run[0][1], low, high)}")
+        places.append(f"{_x(run[0][0], *ends) + 1:.1f} {_y(run[0][1], *span)}")
     return "M" + "L".join(places)

@@ -1,4 +1,4 @@
-"""Pictures of depth for people: coloured depth, error maps, strips of frames, curves."""
+"""Pictures of depth for people: coloured depth, error maps, curves, clouds."""
 
 from __future__ import annotations
 
@@ -11,12 +11,8 @@ from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from dyfn_core.prediction import DEPTH
-from dyfn_core.scoring.protocols import align_depth
-
 INVALID = (70, 70, 70)
 MAX_ERROR = 0.5  # relative error that the error map saturates at
-CAPTION_HEIGHT = 22
 
 
 def colour_depth(depth: np.ndarray, near: float, far: float) -> np.ndarray:
@@ -77,86 +73,6 @@ def snapshot(
     if truth is not None:
         truth = cv2.resize(truth, size, interpolation=cv2.INTER_NEAREST)
     return DepthSnapshot(index, small, depth, truth)
-
-
-class FrameStrip:
-    """Keeps a few evenly spaced frames of a sequence and draws them side by side.
-
-    quantity: what is added as depth; disparity is drawn as the inverse of the aligned one.
-    """
-
-    def __init__(
-        self, expected_frames: int, count: int = 6, width: int = 240, quantity: str = DEPTH
-    ) -> None:
-        self.quantity = quantity
-        last = max(expected_frames - 1, 0)
-        self.wanted = {round(i) for i in np.linspace(0, last, min(count, last + 1))}
-        self.width = width
-        self.snapshots: list[DepthSnapshot] = []
-
-    def add(
-        self, index: int, image: np.ndarray, depth: np.ndarray, truth: np.ndarray | None
-    ) -> None:
-        """Keep the frame if it is one of the wanted ones; arrays as in DepthSnapshot, any size."""
-        if index not in self.wanted:
-            return
-        self.snapshots.append(snapshot(index, image, depth, truth, self.width))
-
-    def draw(self, scale: float = 1.0, shift: float = 0.0) -> np.ndarray:
-        """One row a frame: input, ground truth, depth, error (the middle and last need truth).
-
-        scale, shift: one alignment for all frames (the video protocol's), so that drift shows.
-        Returns H x W x 3 uint8 RGB. Raises ValueError when no frame was kept.
-        """
-        if not self.snapshots:
-            raise ValueError("no frame was kept for the strip")
-        truths = [s.truth for s in self.snapshots if s.truth is not None]
-        aligned = [align_depth(s.depth, scale, shift, self.quantity) for s in self.snapshots]
-        near, far = depth_range(truths or aligned)
-        rows = [
-            self._row(s, depth, near, far, bool(truths))
-            for s, depth in zip(self.snapshots, aligned, strict=True)
-        ]
-        names = ["input", "ground truth", "depth", "error"] if truths else ["input", "depth"]
-        unit = f"{near:.1f} to {far:.1f} m" if truths else "up to scale"
-        return np.vstack([_captions(names, self.width, unit), *rows])
-
-    def _row(
-        self, snapshot: DepthSnapshot, depth: np.ndarray, near: float, far: float, with_truth: bool
-    ) -> np.ndarray:
-        image = snapshot.image.copy()
-        _write(image, f"{snapshot.index}", (4, image.shape[0] - 6))
-        cells = [image, colour_depth(depth, near, far)]
-        if with_truth:
-            truth = np.full(depth.shape, np.nan) if snapshot.truth is None else snapshot.truth
-            cells.insert(1, colour_depth(truth, near, far))
-            cells.append(colour_error(depth, truth))
-        return np.hstack([np.pad(c, ((1, 1), (1, 1), (0, 0))) for c in cells])
-
-
-def _captions(names: list[str], width: int, unit: str) -> np.ndarray:
-    bar = np.full((CAPTION_HEIGHT, (width + 2) * len(names), 3), 255, np.uint8)
-    for column, name in enumerate(names):
-        text = f"error, 0 to {MAX_ERROR:.0%}" if name == "error" else name
-        text = f"depth, {unit}" if name == "depth" else text
-        cv2.putText(
-            bar,
-            text,
-            (column * (width + 2) + 4, 16),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.45,
-            0,
-            1,
-            cv2.LINE_AA,
-        )
-    return bar
-
-
-def _write(image: np.ndarray, text: str, corner: tuple[int, int]) -> None:
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            image, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA
-        )
 
 
 def draw_cloud(

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from dyfn_core.evaluation.report.curves import Curves, Histogram
-from dyfn_core.evaluation.report.html import (
-    Cell,
-    KeyFigures,
-    Part,
-    ReportPicture,
-    Section,
-    Table,
-    Text,
+from dyfn_core.evaluation.report.cloud_view import CloudView
+from dyfn_core.evaluation.report.curves import Histogram
+from dyfn_core.evaluation.report.frame_grid import frame_grid
+from dyfn_core.evaluation.report.html import Cell, Part, ReportPicture, Section, Table, Text
+from dyfn_core.evaluation.report.variants import (
+    Variant,
+    headline,
+    key_figures,
+    over_time,
+    seconds_axis,
 )
-from dyfn_core.evaluation.sequence import (
-    SequenceEvaluation,
-    latency_marks,
-    over_median,
-    score_table,
-)
+from dyfn_core.evaluation.sequence import SequenceEvaluation, latency_marks, score_table
+from dyfn_core.scoring.protocols import SequenceScorer
 
 SCORE_NOTE = (
     "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
@@ -38,80 +34,115 @@ WORST_NOTE = (
 )
 
 
+FRAMES_NOTE = (
+    "One alignment (scale and shift) to the truth for all frames of a run, so that drift shows; "
+    "what is in metres is shown as it is."
+)
+UNALIGNED_NOTE = "Without ground truth a depth has no unit: red is near, blue is far."
+COLUMNS = ("scale", "shift", "video_abs_rel", "image_abs_rel", "metric_abs_rel")
+
+
 def sequence_sections(
     runs: Mapping[str, SequenceEvaluation],
     clouds: Mapping[str, np.ndarray] | None = None,
     note: str = "",
+    *,
+    base: str | None = None,
+    cloud: CloudView | None = None,
 ) -> list[Section]:
     """What there is to show of one sequence under one or more ways to run it.
 
-    runs: name -> the evaluation of the same frames; the first is the one the report is about.
-    clouds: name -> picture of a cloud, H x W x 3 uint8 RGB. note: more about the scores.
+        runs = {"DyFN": with_dyfn, "base model": without, "DyFN + odometry": metric}
+        sections = sequence_sections(runs, base="base model")
+        write_report("report.html", "Title", sections)
+
+    Every run is in the sentence and the key figures on top, in the table, in every curve and in
+    the strip of frames, under its name; runs whose depth is in metres (`metric=True` of push) have
+    the metric protocol beside the others. Controls of the first run are drawn grey.
+
+    Args:
+        runs: Name -> the evaluation of the same frames; the first is what the report is about.
+        clouds: Name -> picture of a cloud, H x W x 3 uint8 RGB.
+        note: More about the scores.
+        base: The run that the others are compared with.
+        cloud: Clouds that can be turned.
+
+    Returns:
+        Sections for write_report; those that need ground truth are left out without it.
+
+    Raises:
+        ValueError: base is no run, or the first one.
     """
+    if base is not None and base not in [*runs][1:]:
+        raise ValueError(f"base is {base!r}, expected one of the runs after the first: {[*runs]}")
+    first = next(iter(runs.values()))
+    variants = variants_of(runs, base)
     results = {name: run.results() for name, run in runs.items()}
+    curves = over_time(variants, first.column("stamp"))
+    pictures = {f"Cloud, {name}": picture for name, picture in (clouds or {}).items()}
     scores: list[Part] = [score_table(results), Text(SCORE_NOTE + note, note=True)]
     return [
-        Section("At a glance", [_key_figures(next(iter(results.values())))]),
-        Section("Scores", scores),
-        *_over_time(runs),
-        *(
-            Section(f"Frames, {name}", [ReportPicture(run.draw_strip(), f"some frames, {name}")])
-            for name, run in runs.items()
-        ),
-        *(
-            Section(f"Cloud, {name}", [ReportPicture(cloud, f"cloud, {name}")])
-            for name, cloud in (clouds or {}).items()
-        ),
-        *(section for name, run in runs.items() for section in _worst(name, run)),
+        Section("At a glance", [Text(headline(variants), lead=True), key_figures(variants)]),
+        *([Section("Frames", _frames(runs, base))] if first.strip.snapshots else []),
+        *([Section("Over time", curves)] if curves else []),
+        *([Section("Scores", scores)] if first.video() is not None else []),
+        *([Section("Cloud", [cloud])] if cloud is not None else []),
+        *(Section(name, [ReportPicture(shown, name)]) for name, shown in pictures.items()),
+        *(found for name, run in runs.items() if name != base for found in _worst(name, run)),
         latency_section({name: run.column("latency_ms") for name, run in runs.items()}),
     ]
 
 
-def _key_figures(result: Mapping[str, Any]) -> KeyFigures:
-    video, spread = result["video"] or {}, result["spread"] or {}
-    latency = result["latency_ms"] or {}
-    figures: dict[str, Cell] = {
-        "frames": result["frames"],
-        "AbsRel, video protocol": video.get("abs_rel"),
-        "delta1, video protocol": video.get("delta1"),
-        "spread of log scale": spread.get("log_scale_std"),
-        "latency p50, ms": None if "p50" not in latency else f"{latency['p50']:.1f}",
-        "latency p99, ms": None if "p99" not in latency else f"{latency['p99']:.1f}",
-    }
-    return KeyFigures({name: value for name, value in figures.items() if value is not None})
+def variants_of(runs: Mapping[str, SequenceEvaluation], base: str | None = None) -> list[Variant]:
+    """Evaluations, and the controls of the first, as the report compares them.
+
+    Args:
+        runs: Name -> evaluation.
+        base: The run that the others are compared with.
+
+    Returns:
+        In the order of runs, then the controls ("control: NAME") that could be scored.
+    """
+    found = []
+    for name, run in runs.items():
+        columns = {column: run.column(column) for column in COLUMNS}
+        scores = {**run.results(), "quantity": run.quantity}
+        found.append(Variant(name, "base" if name == base else "result", scores, columns))
+    return [*found, *_controls(next(iter(runs.values())).controls)]
 
 
-def _over_time(runs: Mapping[str, SequenceEvaluation]) -> list[Section]:
-    def lines(column: str) -> dict[str, np.ndarray]:
-        return {name: run.column(column) for name, run in runs.items()}
+def _controls(scorers: Mapping[str, SequenceScorer]) -> Iterator[Variant]:
+    for name, scorer in scorers.items():
+        video = scorer.video()
+        if video is not None:
+            columns = {
+                "scale": scorer.frames.column("scale"),
+                "video_abs_rel": video.frames.column("abs_rel"),
+                "image_abs_rel": scorer.frames.metrics.column("abs_rel"),
+            }
+            yield Variant(f"control: {name}", "control", {"video": video.metrics}, columns)
 
-    scale = lines("scale")
-    if np.isnan(np.concatenate(list(scale.values()))).all():
-        return []
-    parts = over_time_curves(scale, lines("shift"), lines("video_abs_rel"))
-    parts.append(Curves("AbsRel, each frame by itself (image)", lines("image_abs_rel")))
-    return [Section("Over time", parts)]
+
+def _frames(runs: Mapping[str, SequenceEvaluation], base: str | None) -> list[Part]:
+    first = next(iter(runs.values()))
+    order = sorted(runs, key=lambda name: name != base)  # what the others are compared with, first
+    shown = {name: runs[name].shown_frames() for name in order}
+    note = UNALIGNED_NOTE if first.video() is None else FRAMES_NOTE
+    grid = frame_grid(shown, _frame_label(first.column("stamp")), "some frames")
+    return [grid, Text(note, note=True)]
 
 
-def over_time_curves(
-    scale: Mapping[str, np.ndarray],
-    shift: Mapping[str, np.ndarray],
-    video_abs_rel: Mapping[str, np.ndarray],
-) -> list[Part]:
-    """What wanders over a sequence, of every frame by name; NaN: a gap."""
-    relative = {name: over_median(values) for name, values in scale.items()}
-    return [
-        Curves("Scale that fits each frame, over its median (flat is stable)", relative),
-        Curves("Shift that fits each frame", shift),
-        Curves("AbsRel, one alignment for the sequence (video)", video_abs_rel),
-    ]
+def _frame_label(stamps: np.ndarray) -> Callable[[int], str]:
+    """Names a frame by its time from the start, or by its number where stamps fall."""
+    seconds, _ = seconds_axis(stamps)
+    return lambda index: f"frame {index}" if seconds is None else f"{seconds[index]:.2f} s"
 
 
 def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
     video = run.video()
     if video is None:
         return []
-    errors, stamps = run.column("video_abs_rel"), run.column("stamp")
+    errors, label = run.column("video_abs_rel"), _frame_label(run.column("stamp"))
     table: list[list[Cell]] = []
     shown = []
     for index in run.worst.choose(errors):
@@ -119,13 +150,12 @@ def _worst(name: str, run: SequenceEvaluation) -> list[Section]:
         if found is not None:
             shown.append(found)
         picture = "not kept" if found is None else f"frame {found.index}"
-        table.append([f"frame {index}", f"{stamps[index]:.3f}", float(errors[index]), picture])
-    header = ("worst first", "stamp, s", "AbsRel", "picture")
+        table.append([f"frame {index}", label(index), float(errors[index]), picture])
+    header = ("worst first", "time", "AbsRel", "picture")
     parts: list[Part] = [Table(header, table), Text(WORST_NOTE, note=True)]
     if shown:
-        parts.insert(
-            1, ReportPicture(run.worst.draw(shown, video.scale, video.shift), "worst frames")
-        )
+        frames = {name: run.worst.shown(shown, video.scale, video.shift)}
+        parts.insert(1, frame_grid(frames, lambda index: f"frame {index}", "worst frames"))
     return [Section(f"Worst frames, {name}", parts)]
 
 

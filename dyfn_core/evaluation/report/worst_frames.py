@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.evaluation.report.pictures import DepthSnapshot, FrameStrip, snapshot
+from dyfn_core.evaluation.report.frame_grid import ShownFrames
+from dyfn_core.evaluation.report.pictures import DepthSnapshot, snapshot
 from dyfn_core.prediction import DEPTH, DISPARITY
 from dyfn_core.scoring.frame_scores import FrameScore
 
@@ -86,8 +87,6 @@ class WorstFrames:
         found = [kept[place].snapshot for kept in self._kept if place in kept]
         return max(found, key=lambda s: np.nan_to_num(errors[s.index]), default=None)
 
-    def draw(self, snapshots: Sequence[DepthSnapshot], scale: float, shift: float) -> np.ndarray:
-        """One row a frame, as FrameStrip.draw."""
-        strip = FrameStrip(0, width=WIDTH, quantity=self.quantity)
-        strip.snapshots = list(snapshots)
-        return strip.draw(scale, shift)
+    def shown(self, snapshots: Sequence[DepthSnapshot], scale: float, shift: float) -> ShownFrames:
+        """Kept frames, aligned by one scale and shift."""
+        return ShownFrames(snapshots, scale, shift, self.quantity)

@@ -86,9 +86,10 @@ def test_files_are_scored_by_value(tmp_path: Path, capsys: pytest.CaptureFixture
     ratios = np.divide(scale[1:], scale[:-1])
     assert ratios == pytest.approx([(1 + 0.1 * i) / (1.1 + 0.1 * i) for i in range(5)], rel=1e-3)
     page = (out / "report.html").read_text()
-    assert page.count("<svg") == 3 and "http" not in page
+    assert page.count('role="img"') == 3 and "http" not in page
     assert "Over time, rgbd_dataset_freiburg1_made" in page and str(folder) in page
-    assert page.count("data:image/jpeg") == 2  # strip, worst frames
+    assert "The scale of mine wanders by" in page
+    assert page.count("data:image/jpeg") == 4 * (3 + 6)  # strip, worst frames
     errors = read(out)["sequences"][0]["over_time"]["mine"]["video_abs_rel"]
     worst = int(np.argmax(errors))
     first = page[page.index("<th>worst first") :].split("<tr>")[1]
@@ -256,7 +257,7 @@ def test_pictures_are_few_however_many_sequences_and_the_worst_are_the_runs(
         for i in range(6):
             yield depth(i, TUM) * (1.3 if rough.get(sequence.name) == i else 1)
 
-    pictures = BenchmarkPictures(names, "depth")
+    pictures = BenchmarkPictures(names, "depth", ["m"], ["m"])
     evaluate(many, ArrayMethod("m", "depth", says), Scoring(temporal=False), pictures=pictures)
     assert len(pictures.strips) == STRIPS and {"room 0", "room 39"} <= set(pictures.strips)
     assert len(pictures.worst) == WORST
@@ -267,7 +268,8 @@ def test_pictures_are_few_however_many_sequences_and_the_worst_are_the_runs(
     numbers = opened.sequences[0].numbers
     assert all(frame.number == numbers[frame.frame] for frame in pictures.worst)
     strip = pictures.strips["room 0"]
-    assert strip.shape[1] == 4 * (WIDTH + 2)  # input, truth, depth, error
+    assert [*strip.columns] == ["input", "ground truth", "m", "error, m"]
+    assert {picture.shape[1] for row in strip.rows.values() for picture in row} == {WIDTH}
 
 
 def moving_scale(sequence: BenchmarkSequence) -> Iterator[np.ndarray]:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dyfn_core.evaluation.report.frame_grid import BAR, FrameStrip
 from dyfn_core.evaluation.report.html import (
     ReportPicture,
     Section,
@@ -17,7 +18,6 @@ from dyfn_core.evaluation.report.html import (
 )
 from dyfn_core.evaluation.report.pictures import (
     INVALID,
-    FrameStrip,
     colour_depth,
     colour_error,
     curves,
@@ -68,7 +68,7 @@ def test_the_strip_shows_the_aligned_prediction_beside_the_truth() -> None:
     strip.add(0, np.zeros((60, 80, 3), np.uint8), truth / 4, truth)
     right, wrong = strip.draw(4, 0).astype(int), strip.draw(1, 0).astype(int)
     columns = [slice(82 * i + 1, 82 * i + 81) for i in range(4)]
-    rows = slice(-61, -1)
+    rows = slice(-61 - BAR, -1 - BAR)
     assert right.shape[1] == 4 * 82
     assert np.abs(right[rows, columns[1]] - right[rows, columns[2]]).mean() < 1
     assert np.abs(wrong[rows, columns[1]] - wrong[rows, columns[2]]).mean() > 30

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from dyfn_core.evaluation.report.curves import curves_html, decimate, histogram_html
-from dyfn_core.evaluation.report.html import Curves, Histogram, KeyFigures, Section, write_report
+from dyfn_core.evaluation.report.html import (
+    Curves,
+    Histogram,
+    KeyFigure,
+    KeyFigures,
+    Section,
+    write_report,
+)
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.report.worst_frames import KEPT, STRETCHES
 from dyfn_core.evaluation.sequence import SequenceEvaluation
@@ -56,7 +63,7 @@ def test_a_curve_holds_its_values_for_the_script() -> None:
     assert found is not None
     data = json.loads(found.group(1))
     assert data["lines"][0] == {"name": "</script>x", "points": [[0, 1.0], [2, 2.5]]}
-    assert data["last"] == 2
+    assert data["ends"] == [0, 2]
     assert page.count('class="plot"') == 2 and "NaN" not in page and "nan" not in page
     assert "<svg" in curves_html(Curves("nothing", {"x": [None, None]}))
 
@@ -92,7 +99,7 @@ def test_with_and_without_stand_in_one_page(tmp_path: Path) -> None:
     drift[17] = 4.0
     runs = {"with": evaluation(np.ones(40)), "without": evaluation(drift)}
     cloud = np.zeros((8, 8, 3), np.uint8)
-    sections = sequence_sections(runs, {"fused": cloud})
+    sections = sequence_sections(runs, {"fused": cloud}, base="without")
     write_report(tmp_path / "r.html", "Both", sections)
     page = (tmp_path / "r.html").read_text()
     checker = Checker()
@@ -100,20 +107,18 @@ def test_with_and_without_stand_in_one_page(tmp_path: Path) -> None:
     assert not checker.open
     assert [s.title for s in sections] == [
         "At a glance",
-        "Scores",
+        "Frames",
         "Over time",
-        "Frames, with",
-        "Frames, without",
+        "Scores",
         "Cloud, fused",
         "Worst frames, with",
-        "Worst frames, without",
         "Latency",
     ]
-    assert "frame 17" in page and "6.700" in page
-    assert page.count("data:image/") == 5
+    assert "without" in page and "6.70 s" not in page  # the worst frames of the base are its own
+    assert page.count("data:image/") == 6 * 6 + 1 + 6 * 4
     assert "http" not in page and "prefers-color-scheme: dark" in page
     without_script = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
-    assert without_script.count("<svg") == 5 and "p99" in without_script
+    assert without_script.count('role="img"') == 5 and "p99" in without_script
 
 
 def test_the_worst_frame_is_found_whatever_the_alignment() -> None:
@@ -137,7 +142,7 @@ def test_memory_of_the_worst_is_bounded_also_when_the_count_was_wrong() -> None:
 
 def test_without_truth_there_is_no_error_but_a_report(tmp_path: Path) -> None:
     sections = sequence_sections({"run": evaluation(np.ones(3), truth=False)})
-    assert [s.title for s in sections] == ["At a glance", "Scores", "Frames, run", "Latency"]
+    assert [s.title for s in sections] == ["At a glance", "Frames", "Latency"]
     write_report(tmp_path / "r.html", "t", sections)
 
 
@@ -146,7 +151,7 @@ class LongRun(SequenceEvaluation):
 
     def column(self, name: str) -> np.ndarray:
         scale, shift, error = np.random.default_rng(0).lognormal(size=(3, LONG))
-        errors = {"video_abs_rel": error, "image_abs_rel": error / 2}
+        errors = {"video_abs_rel": error, "image_abs_rel": error / 2, "metric_abs_rel": error * 3}
         times = {"latency_ms": 20 + scale, "stamp": np.arange(LONG) / 30}
         return {"scale": scale, "shift": shift, **errors, **times}[name]
 
@@ -168,9 +173,11 @@ def test_a_long_recording_has_a_small_report(tmp_path: Path) -> None:
 
 
 def test_key_figures_are_escaped(tmp_path: Path) -> None:
-    write_report(tmp_path / "r.html", "t", [Section("s", [KeyFigures({"a<b": 0.5, "n": 3})])])
+    figures = KeyFigures([KeyFigure("a<b", "0.500", beside={"<i>": "3"}), KeyFigure("n", "3")])
+    write_report(tmp_path / "r.html", "t", [Section("s", [figures])])
     page = (tmp_path / "r.html").read_text()
-    assert "<b>0.500</b><span>a&lt;b</span>" in page and "<b>3</b>" in page
+    assert "<span>a&lt;b</span><b>0.500</b><small>&lt;i&gt;: 3</small>" in page
+    assert "<b>3</b>" in page
 
 
 @pytest.mark.parametrize("count", [1, 2])
