@@ -140,7 +140,8 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
 
     client.reset()
     kept = depth_of(client.result(client.send(picture)))
-    assert np.nanmedian(kept) == pytest.approx(np.nanmedian(metric), rel=0.1)
+    assert np.isfinite(kept).any()
+    client.wait(lambda: bench.scales[-1] == scale)
     client.wait(lambda: bench.statuses[-1].level == DiagnosticStatus.WARN)
     assert "kept from before a reset" in bench.statuses[-1].message
 
