@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_worlds.camera.cameras import CameraLens, random_view
-from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.camera.photographer import SAMPLES, Photographer
 from dyfn_worlds.camera.staging import stand
 from dyfn_worlds.generate import RoomWorlds
 from dyfn_worlds.render.occlusion import shade_corners
@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--rooms", type=int, default=4)
     options = parser.parse_args()
     worlds, renderer = RoomWorlds(options.assets), Renderer((240, 320))
-    rows: dict[str, list[float]] = {"plain": [], "moving": [], "corners": [], "clip frame": []}
+    rows: dict[str, list[float]] = {"plain": [], "moving": [], "corners": []}
     for seed in range(options.rooms):
         rng = np.random.default_rng([seed, 1])
         photographer = Photographer(renderer, worlds.scene(rng, False), rng)
@@ -52,7 +52,10 @@ def main() -> None:
             rows["corners"].append(
                 cpu(lambda p=picture: shade_corners(p.image, p.depth, 0.8, 1.0))  # type: ignore[misc]
             )
-        rows["clip frame"].append(cpu(lambda p=photographer: p.clip(24, 4.8)) / 24)  # type: ignore[misc]
+        for samples in range(SAMPLES, 0, -1):  # the same clip each time
+            filming = Photographer(renderer, scene, np.random.default_rng(seed), samples=samples)
+            times = rows.setdefault(f"clip frame, samples {samples}", [])
+            times.append(cpu(lambda p=filming: p.clip(24, 4.8)) / 24)  # type: ignore[misc]
     for name, times in rows.items():
         ratio = np.mean(times) / np.mean(rows["plain"])
         print(f"{name}: {np.mean(times):.1f} ms of CPU, {ratio:.2f} times a plain frame")

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dyfn_worlds.camera.cameras import PLACEMENTS, USUAL
 from dyfn_worlds.camera.paths import PACES
+from dyfn_worlds.camera.photographer import SAMPLES
 from dyfn_worlds.generate import MapWorlds, RoomWorlds, ShardJob, render
 
 UNUSABLE, INTERRUPTED = 2, 130
@@ -116,6 +117,14 @@ def parser() -> argparse.ArgumentParser:
         metavar="HEIGHTxWIDTH",
         help="image size in pixels (default: 240x320)",
     )
+    add(
+        "--samples",
+        type=int,
+        choices=range(1, SAMPLES + 1),
+        default=SAMPLES,
+        help="draws within each pixel of a sharp picture, and that share of the sub-frames of a "
+        f"blurred one; fewer are faster and less smooth (default: {SAMPLES})",
+    )
     return parser
 
 
@@ -149,6 +158,7 @@ def _render(options: argparse.Namespace) -> None:
         options.clip_fps,
         options.placement,
         options.pace,
+        options.samples,
     )
     if not options.assets.is_dir():
         raise NotADirectoryError(f"--assets {options.assets}: no such folder")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_worlds.camera.cameras import USUAL
-from dyfn_worlds.camera.photographer import Photographer
+from dyfn_worlds.camera.photographer import SAMPLES, Photographer
 from dyfn_worlds.casting import Cast
 from dyfn_worlds.maps.quake import GameFiles, MapError, load_map
 from dyfn_worlds.render.renderer import Renderer
@@ -34,6 +34,7 @@ class ShardJob:
     clip_frames: length of a clip; 0 renders independent views, `views` of them for each shard.
     clip_fps: frames in a second of the walk; low is far from frame to frame. placement: of
     independent views, one of cameras.PLACEMENTS. pace: of clips, one of paths.PACES; None draws it.
+    samples: draws within a pixel, 1 to SAMPLES.
     """
 
     worlds: str
@@ -45,6 +46,7 @@ class ShardJob:
     clip_fps: float = 5.0
     placement: str = USUAL
     pace: str | None = None
+    samples: int = SAMPLES
 
 
 class MapWorlds:
@@ -108,7 +110,7 @@ def render(
         rng = np.random.default_rng([zlib.crc32(job.worlds.encode()), bool(job.clip_frames), seed])
         try:
             scene = worlds.scene(rng, held_out)
-            photographer = Photographer(renderer, scene, rng, job.placement, job.pace)
+            photographer = Photographer(renderer, scene, rng, job.placement, job.pace, job.samples)
             if job.clip_frames:
                 views = photographer.clip(job.clip_frames, job.clip_frames / job.clip_fps)
             else:

@@ -22,6 +22,7 @@ MAX_SUBFRAMES = 8
 PIXELS_A_SUBFRAME = 1.6
 GAINS = (0.05, 40.0)
 SUBPIXELS = ((-0.33, 0.15), (0.15, 0.33), (0.33, -0.33))
+SAMPLES = len(SUBPIXELS) + 1
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,11 @@ def _always(moment: Moment, seconds: float) -> Moment:
 
 
 class Photographer:
-    """Looks before it shoots: exposure from a small probe, and views not worth keeping refused."""
+    """Looks before it shoots: exposure from a small probe, and views not worth keeping refused.
+
+    samples: draws within a pixel of a sharp picture, 1 to SAMPLES; a blurred one has the same
+    share of its sub-frames.
+    """
 
     def __init__(
         self,
@@ -69,8 +74,9 @@ class Photographer:
         rng: np.random.Generator,
         placement: str = USUAL,
         pace: str | None = None,
+        samples: int = SAMPLES,
     ) -> None:
-        self.placement, self.pace = placement, pace
+        self.placement, self.pace, self.samples = placement, pace, samples
         self.renderer, self.scene, self.rng = renderer, scene, rng
         self.space = FreeSpace(scene)
         self.style = Style.sample(rng)
@@ -167,12 +173,13 @@ class Photographer:
         now, look = moment(t), self._look(exposure)
         sharp = self.renderer.draw(camera(t), look, now)
         blur = self._blur(camera, sharp, now, t)
-        steps = int(np.clip(np.ceil(blur / PIXELS_A_SUBFRAME), 1, MAX_SUBFRAMES))
+        share = self.samples / SAMPLES
+        steps = int(np.clip(np.ceil(share * blur / PIXELS_A_SUBFRAME), 1, share * MAX_SUBFRAMES))
         if steps > 1:
             offsets = self.style.shutter * ((np.arange(steps) + 0.5) / steps - 0.5)
             parts = [self.renderer.draw(camera(t + o), look, moment(t + o)) for o in offsets]
         else:  # several samples within a pixel, since no camera has jagged edges
-            nudged = [self._nudged(camera(t), by) for by in SUBPIXELS]
+            nudged = [self._nudged(camera(t), by) for by in SUBPIXELS[: self.samples - 1]]
             parts = [sharp, *(self.renderer.draw(at, look, now) for at in nudged)]
         squares = np.sum([np.square(part.image, dtype=np.float32) for part in parts], axis=0)
         image = np.sqrt(squares / len(parts)).astype(np.uint8)

@@ -80,6 +80,20 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path, renderer: Renderer) 
     assert contents[0] == contents[1]
 
 
+def test_fewer_samples_change_the_colours_and_not_the_depth(
+    tmp_path: Path, renderer: Renderer
+) -> None:
+    drawn = []
+    for samples in (1, 2, 4):
+        out, job = tmp_path / str(samples), ShardJob("rooms", 1, 4, 0, 5, SIZE, samples=samples)
+        render(job, RoomWorlds(tmp_path), out, lambda line: None)
+        depth, image = (next(out.rglob(f"00000.{kind}")) for kind in ("png", "jpg"))
+        drawn.append((depth.read_bytes(), cv2.imread(str(image)).astype(float)))
+    (depth_1, one), (depth_2, two), (depth_4, four) = drawn
+    assert depth_1 == depth_2 == depth_4
+    assert 0 < np.abs(two - four).mean() < np.abs(one - four).mean()
+
+
 def test_a_path_keeps_clear_of_every_surface(room: Scene) -> None:
     space, rng = FreeSpace(room), np.random.default_rng(0)
     path = random_path(space, rng, CameraLens((0.8, 1.0)), 2.0)

@@ -139,8 +139,11 @@ def gru_inputs(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
     ):
         with torch.no_grad():
             inputs.append(dyfn.gru_input(latent, latent.mean((-2, -1))).half())
-            z = decoded_z(model, Latent(latent, half, clips.network_size))
-            level = mean_log(z, depth)
+        parts = [
+            decoded_with_slope(model, Latent(some, half, clips.network_size), known)
+            for some, known in zip(latent.split(TOGETHER), depth.split(TOGETHER), strict=True)
+        ]
+        z, level, slope = (torch.cat(part) for part in zip(*parts, strict=True))
         focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / (aspect**2 + 1) ** 0.5
         valid = torch.isfinite(depth) & (depth > 0)
         truth = torch.where(valid, depth, 1.0).log().sum((1, 2)) / valid.sum((1, 2)).clamp(min=1)
@@ -148,11 +151,7 @@ def gru_inputs(model: GeometryModel, batch: ClipBatch) -> dict[str, Tensor]:
         errors.append(torch.where(seen, level - truth + focal.log(), torch.nan))
         depths.append(samples(z))
         truths.append(samples(torch.where(valid, depth, torch.nan)))
-        slope = [
-            scale_slope(model, Latent(some, half, clips.network_size), known)
-            for some, known in zip(latent.split(TOGETHER), depth.split(TOGETHER), strict=True)
-        ]
-        slopes.append(torch.cat(slope).half())
+        slopes.append(slope.half())
     return {
         "gru_input": torch.stack(inputs).contiguous(),
         "error": torch.stack(errors),
@@ -186,8 +185,20 @@ def samples(image: Tensor) -> Tensor:
     return image[:, rows[:, None], columns[None]].flatten(1).contiguous()
 
 
-def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
-    """B x 2C: derivative of each frame's mean_log by its residual gamma and beta, at zero."""
+def decoded_with_slope(
+    model: GeometryModel, latent: Latent, depth: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One pass of the decoder, and back.
+
+    Args:
+        model: The base and its DyFN.
+        latent: Of B frames.
+        depth: B x h x w, the true one; decides the pixels that count.
+
+    Returns:
+        z (B x h x w), its mean_log (B), and the derivative of that by each frame's residual gamma
+        and beta, at zero (B x 2C).
+    """
     features = latent.features
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
     change = features.new_zeros(len(features), 2 * features.shape[1], 1, 1, requires_grad=True)
@@ -195,5 +206,6 @@ def scale_slope(model: GeometryModel, latent: Latent, depth: Tensor) -> Tensor:
         gamma, beta = change.chunk(2, dim=1)
         moved = gamma.exp() * (features - mean) + mean + std * beta
         z = decoded_z(model, Latent(moved, latent.image_size, latent.network_size))
-        (slope,) = torch.autograd.grad(mean_log(z, depth).sum(), change)
-    return slope.flatten(1)
+        level = mean_log(z, depth)
+        (slope,) = torch.autograd.grad(level.sum(), change)
+    return z.detach(), level.detach(), slope.flatten(1)

@@ -19,10 +19,10 @@ from dyfn_core.training.dyfn_config import DyFNRunConfig
 from dyfn_core.training.loop.run_folder import read_log
 from dyfn_core.training.tasks.dyfn_linearized import LinearizedTask
 from dyfn_core.training.tasks.gru_input_cache import (
+    decoded_with_slope,
     decoded_z,
     gru_inputs,
     mean_log,
-    scale_slope,
 )
 from dyfn_core.training.tasks.latent_cache import encode_clips
 from tests.support.seeded import normal, redraw
@@ -84,7 +84,9 @@ def test_slope_is_how_the_scale_moves_with_the_statistics(place: Path, tmp_path:
     made = task(place, tmp_path)
     features = normal(3, 2, 8, 4, 8) * torch.tensor([1.0, 3.0]).view(2, 1, 1, 1)
     latent, depth = Latent(features, (16, 32), (32, 64)), torch.ones(2, 16, 32)
-    slope = scale_slope(made.model, latent, depth)
+    z, level, slope = decoded_with_slope(made.model, latent, depth)
+    torch.testing.assert_close(z, decoded_z(made.model, latent).detach())
+    torch.testing.assert_close(level, z.log().mean((1, 2)))
     # Mostly along the slope, so that no sum of terms of both signs is compared.
     change = 0.003 * (torch.nn.functional.normalize(slope) + 0.25 * normal(4, 2, 16))
     std, mean = torch.std_mean(features, dim=(-2, -1), keepdim=True)
