@@ -93,21 +93,35 @@ class Camera:
 
     def _subscribe(self, ports: NodeTopics) -> None:
         settings = self.settings
-        kind = ReliabilityPolicy.RELIABLE if settings.reliable else ReliabilityPolicy.BEST_EFFORT
+        kinds, follow = ReliabilityPolicy, settings.reliability == "auto"
         qos = QoSProfile(
             depth=_SENSOR_DEPTH if settings.drop_frames else settings.queue_size,
             history=HistoryPolicy.KEEP_LAST,
-            reliability=kind,
+            reliability=kinds.RELIABLE if settings.reliability == "reliable" else kinds.BEST_EFFORT,
         )
-        topic = f"{self.prefix}image"
+        topic, kind = f"{self.prefix}image", Image
         if settings.image_transport == "compressed":
             # Beside the image topic, also when that is remapped, as image_transport has it.
-            topic = f"{self._node.resolve_topic_name(topic)}/compressed"
-            images = ports.subscription(CompressedImage, topic, self._on_image, qos)
-        else:
-            images = ports.subscription(Image, topic, self._on_image, qos)
-        infos = ports.subscription(CameraInfo, f"{self.prefix}camera_info", self._on_info, qos)
-        self.image_topic, self.info_topic = images.topic_name, infos.topic_name
+            topic, kind = f"{self._node.resolve_topic_name(topic)}/compressed", CompressedImage
+        count = self.statistics.count
+        self._images = ports.follow(
+            kind, topic, self._on_image, qos, follow, lambda number: count("lost", number)
+        )
+        infos = f"{self.prefix}camera_info"
+        self.info_topic = ports.follow(
+            CameraInfo, infos, self._on_info, qos, follow, lambda number: None
+        ).topic
+        self._latched_info = ports.latched(CameraInfo, infos, self._on_info)
+
+    @property
+    def image_topic(self) -> str:
+        """Resolved."""
+        return self._images.topic
+
+    @property
+    def reliable(self) -> bool:
+        """Whether lost images are sent again."""
+        return self._images.reliable
 
     # Executor's thread: nothing here waits for inference.
 
@@ -120,12 +134,26 @@ class Camera:
         session = self.session
         if not self.active or session is None:
             return
+        if self._info is None:
+            self._latched_info.check()
+            if self.waits_for_info:
+                self._warn(f"{self.image_topic}: {self.waiting}")
         job = FrameJob(self, message, self._info, session.asked, time.monotonic())
         if not self._submit(job):
             self._error(
                 f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
                 "full, newer frames are lost; play slower or raise it",
             )
+
+    @property
+    def waits_for_info(self) -> bool:
+        """Whether frames are held until a CameraInfo comes."""
+        return self._info is None and self.settings.wait_for_camera_info
+
+    @property
+    def waiting(self) -> str:
+        """What holds the frames, in words."""
+        return f"frames are held until a CameraInfo comes on {self.info_topic}"
 
     def request_reset(self, reason: str) -> None:
         """Frames that came before this call never touch the state after it. Any thread."""

@@ -83,6 +83,8 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     }
     for key in ("received", "published", "bad", "failed"):
         values[key] = str(snapshot.counts.get(key, 0))
+    values["lost on the way"] = str(snapshot.counts.get("lost", 0))
+    values["reliability"] = "reliable" if camera.reliable else "best effort"
     values["received while inactive"] = str(snapshot.counts.get("inactive", 0))
     resets = camera.resets
     values["resets"] = str(sum(resets.values()))
@@ -111,6 +113,11 @@ def _camera_problems(
         problems.append((ERROR, f"inference failed on {failed} frames"))
     if bad := snapshot.recent.get("bad"):
         problems.append((ERROR, f"{bad} images on {camera.image_topic} could not be used"))
+    if lost := snapshot.recent.get("lost"):
+        where = f"{lost} images on {camera.image_topic} were lost on the way"
+        problems.append((WARN, f"{where}: {_advice(camera)}"))
+    if camera.waits_for_info and snapshot.recent.get("received"):
+        problems.append((WARN, camera.waiting))
     if report.phase == "active" and not snapshot.recent.get("received"):
         problems.append((WARN, f"no images on {camera.image_topic}"))
     if not snapshot.same_clock:
@@ -118,3 +125,14 @@ def _camera_problems(
     if camera.session is not None:
         problems += [(WARN, text) for text in camera.session.problems()]
     return problems
+
+
+def _advice(camera: Camera) -> str:
+    """What helps when images are lost between publisher and node."""
+    manual = "see 'Large messages' in docs/node.md"
+    if camera.reliable:
+        return f"the driver's queue or transport is too small, {manual}"
+    return (
+        "not every publisher offers reliable delivery (`ros2 topic info -v`); let the driver do "
+        f"so, or give it the Fast DDS profile, {manual}"
+    )

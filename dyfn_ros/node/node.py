@@ -37,6 +37,7 @@ ModelLoader = Callable[[str, str], "GeometryModel"]
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 _PATIENCE = 4.0  # seconds that a transition waits for the frame being worked on
 _LAST_PATIENCE = 2.0  # the same at the end of the process, see end_request.BOUND
+_FOLLOW = 0.5  # seconds between looks at who publishes
 _POLL = 0.1  # seconds between looks at what else may end the wait for a model
 
 
@@ -121,7 +122,7 @@ class StreamDepthNode(LifecycleNode):
         self._make_services()
         self._worker.start()
         while not self._interrupted and not self._worker.wait_prepared(_POLL):
-            pass
+            self._ports.check_publishers()
         if self._worker.error is not None:
             self.get_logger().error(f"cannot configure: {self._worker.error!r}")
         if self._worker.error is not None or self._interrupted:
@@ -140,6 +141,10 @@ class StreamDepthNode(LifecycleNode):
         if result == SUCCESS:
             self._phase = "active"
             self._set_active(True)
+            for camera in self._cameras:
+                count = self.count_publishers(camera.image_topic)
+                now = f"{count} publish it" if count else "nobody publishes it yet"
+                self.get_logger().info(f"waiting for images on {camera.image_topic} ({now})")
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -218,11 +223,14 @@ class StreamDepthNode(LifecycleNode):
                 service = self.create_service(Trigger, f"{prefix}/{name}", partial(answer, indices))
                 self._made.append(partial(self.destroy_service, service))
         self._made.append(self._watch_clock().unregister)
-        period = self.settings.diagnostics_period
-        timer = self.create_timer(
-            period, self.publish_diagnostics, MutuallyExclusiveCallbackGroup()
-        )
-        self._made.append(partial(self.destroy_timer, timer))
+        for name in self._ports.unused_overrides():
+            self._warn(f"{name} was given, but there is no such topic or policy; it has no effect")
+        for callback, period in (
+            (self.publish_diagnostics, self.settings.diagnostics_period),
+            (self._ports.check_publishers, _FOLLOW),
+        ):
+            timer = self.create_timer(period, callback, MutuallyExclusiveCallbackGroup())
+            self._made.append(partial(self.destroy_timer, timer))
 
     def _watch_clock(self) -> Any:
         """Jumps of ROS time (use_sim_time); a looping bag without a clock shows in stamps only."""

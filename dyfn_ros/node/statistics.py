@@ -19,7 +19,8 @@ class StatisticsSnapshot:
     """The numbers of one moment.
 
     counts: since the start: received, published, bad (not usable), failed (inference raised),
-        unpublished (the shutdown came first), inactive (came while the node was not active).
+        unpublished (the shutdown came first), inactive (came while the node was not active), lost
+        (sent, and never here).
     input_rate, output_rate: frames a second since the snapshot before.
     latency: p50 and p99 in seconds from input stamp to publishing, None before the first frame.
     same_clock: whether these latencies are plausible at all.
@@ -48,10 +49,10 @@ class FrameStatistics:
         self._before: Counter[str] = Counter()
         self._at = clock()
 
-    def count(self, what: str) -> None:
-        """One more of these; see StatisticsSnapshot.counts."""
+    def count(self, what: str, number: int = 1) -> None:
+        """So many more of these; see StatisticsSnapshot.counts."""
         with self._lock:
-            self._counts[what] += 1
+            self._counts[what] += number
 
     def published(self, latency: float, processing: float) -> None:
         """A frame is done; seconds from its stamp, and from its arrival."""

@@ -79,8 +79,8 @@ class NodeSettings(ReferenceOptions, StreamOptions):
     reliability: str = _parameter(
         _INPUT,
         "auto",
-        "QoS reliability of the subscriptions. auto: reliable if drop_frames is false, else best "
-        "effort, which every camera driver matches.",
+        "QoS reliability of image and camera_info. auto: reliable when all publishers of the topic "
+        "are, else best effort; looked at again as they come and go.",
         per_camera=True,
         choices=("auto", "best_effort", "reliable"),
     )
@@ -197,13 +197,6 @@ class NodeSettings(ReferenceOptions, StreamOptions):
         per_camera=True,
         range=(0.0, 10.0),
     )
-
-    @property
-    def reliable(self) -> bool:
-        """Whether subscriptions ask for reliable delivery."""
-        if self.reliability == "auto":
-            return not self.drop_frames
-        return self.reliability == "reliable"
 
 
 SPECS: dict[str, Spec] = {entry.name: spec_of(entry) for entry in fields(NodeSettings)}

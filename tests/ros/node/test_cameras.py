@@ -93,6 +93,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         "drop_frames": False,
         "diagnostics_period": 0.1,
         "left.max_gap": 50.0,
+        "left.reliability": "reliable",
     }
     with own_domain() as environment:
         node = tiny_node(environment, tmp_path_factory.mktemp("node"), **parameters)

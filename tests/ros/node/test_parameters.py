@@ -139,21 +139,6 @@ def test_names_of_cameras_make_topics_or_are_refused(names: list[str], reason: s
     assert bool(reason) is bool(found)
 
 
-@pytest.mark.parametrize(
-    ("reliability", "drop_frames", "reliable"),
-    [
-        ("auto", True, False),
-        ("auto", False, True),
-        ("best_effort", False, False),
-        ("reliable", True, True),
-    ],
-)
-def test_auto_reliability_follows_drop_frames(
-    reliability: str, drop_frames: bool, reliable: bool
-) -> None:
-    assert NodeSettings(reliability=reliability, drop_frames=drop_frames).reliable is reliable
-
-
 def test_help_shows_parameters_and_strange_arguments_are_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
