@@ -13,6 +13,7 @@ import numpy as np
 
 from dyfn_core.geometry.rigid import between, inverse, size_of
 from dyfn_core.metric.motion import pose_problem
+from dyfn_core.metric.pose_limits import PoseLimits
 
 SECOND = 1_000_000_000  # stamps are whole nanoseconds: float64 seconds since 1970 are off by 240
 
@@ -24,27 +25,7 @@ NONE_YET, BEFORE, GONE = "none has come yet", "before the first", "older than wh
 LATE, STALE, GAP, OTHER_CLOCK = "not there yet", "stale", "gap", "another clock"
 
 _STILL_LATE = 1.0  # seconds behind which poses that keep coming are of another clock
-_BACK = 0.2  # seconds that a stamp may come late; farther back, time has gone back
 _JITTER = 0.02  # metres, or radians, by which stamps that are not exact move a pose
-
-
-@dataclass(frozen=True)
-class PoseLimits:
-    """What poses are believed.
-
-    Attributes:
-        tolerance: Seconds beyond either end of the poses in which the motion is taken to go on.
-        gap: Seconds between two poses beyond which nothing is known of the time between them.
-        speed: Metres a second; a faster step between two poses is a jump.
-        turn: Radians a second, likewise.
-        capacity: Poses that are kept, the latest; None: all.
-    """
-
-    tolerance: float = 0.05
-    gap: float = 0.5
-    speed: float = 10.0
-    turn: float = 10.0
-    capacity: int | None = 20_000
 
 
 @dataclass(frozen=True)
@@ -83,7 +64,7 @@ class _Kept(NamedTuple):
 class PoseHistory:
     """The poses of one body, for any thread; a moment's pose depends on those around it alone.
 
-    Poses may come up to 0.2 s late and find their place. A stamp that goes back farther (a
+    A pose that comes late finds its place. A stamp that goes back by more than `limits.back` (a
     recording that loops, a clock that was set) ends the history before it.
 
     Attributes:
@@ -162,7 +143,7 @@ class PoseHistory:
     def _refused(self, stamp: int, pose: np.ndarray) -> NoPose | None:
         if problem := pose_problem(pose):
             return NoPose(NO_POSE, problem)
-        if self._stamps and stamp < self._stamps[-1] - round(_BACK * SECOND):
+        if self._stamps and self._stamps[-1] - stamp > self.limits.back * SECOND:
             back = (self._stamps[-1] - stamp) / SECOND
             self._stamps, self._kept, self._dropped = [], [], False
             self._place(0, stamp, pose, self._total, 0)

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
-from dyfn_core.geometry.rigid import inverse, quaternion_rotation, rigid
+from dyfn_core.metric.pose_history import SECOND, Placed
+from dyfn_core.metric.pose_limits import PoseLimits
+from dyfn_ros.messages.camera_poses import CameraPoses
+from dyfn_ros.messages.odometry_options import KINDS, ODOMETRY, TF, OdometryOptions
+from dyfn_ros.messages.transforms import TransformBuffer, TransformError
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_poses
-from dyfn_ros.recordings.storage.open import Storage, open_storage
+from dyfn_ros.recordings.storage.base import Recorded, Storage
+from dyfn_ros.recordings.storage.open import open_storage
 from dyfn_ros.recordings.topics import NONE
-from dyfn_ros.recordings.typestore import POSE, TF
+from dyfn_ros.recordings.typestore import TF as TF_MESSAGE
 
-POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-ODOMETRY = "nav_msgs/msg/Odometry"
-POSE_KINDS = (POSE, POSE_COVARIANCE, ODOMETRY, TF)
 STATIC = "tf_static"
-MAX_GAP = 0.5  # seconds between two poses that are interpolated
-TOLERANCE = 0.02  # seconds beyond the first and the last pose that they stand for
+# Of a whole recording that is read at once: nothing is dropped, and no step is too fast.
+_EVERYTHING = PoseLimits(speed=math.inf, turn=math.inf, back=math.inf, capacity=None)
+
+_TYPES = {kind: f"geometry_msgs/msg/{kind}" for kind in KINDS}
+_TYPES |= {ODOMETRY: f"nav_msgs/msg/{ODOMETRY}", TF: TF_MESSAGE}
 
 # Takes a frame's index and stamp in ns, gives its pose, 4 x 4 camera to world, or None.
 PoseLookup = Callable[[int, int], "np.ndarray | None"]
@@ -32,114 +38,16 @@ class PoseError(RecordingError):
     """There are no usable poses; the message says why."""
 
 
-@dataclass
-class PoseTrack:
-    """The pose of one thing over time; stamps may come in any order."""
-
-    stamps: list[int] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-    _sorted: tuple[np.ndarray, np.ndarray] | None = None
-
-    def add(self, stamp_ns: int, pose: np.ndarray) -> None:
-        """pose: 4 x 4; of several with one stamp the last counts."""
-        self.stamps.append(stamp_ns)
-        self.poses.append(pose)
-        self._sorted = None
-
-    def at(self, stamp_ns: int) -> np.ndarray | None:
-        """Interpolated between neighbours at most MAX_GAP apart; None farther from any pose."""
-        stamps, poses = self._in_order()
-        after = int(np.searchsorted(stamps, stamp_ns))
-        if after < len(stamps) and stamps[after] == stamp_ns:
-            exact: np.ndarray = poses[after]
-            return exact
-        if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= MAX_GAP * 1e9:
-            return _between(poses[after - 1], poses[after], stamps[after - 1 : after + 1], stamp_ns)
-        beside = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
-        nearest = min(beside, key=lambda i: abs(int(stamps[i]) - stamp_ns), default=None)
-        if nearest is None or abs(int(stamps[nearest]) - stamp_ns) > TOLERANCE * 1e9:
-            return None
-        alone: np.ndarray = poses[nearest]
-        return alone
-
-    def _in_order(self) -> tuple[np.ndarray, np.ndarray]:
-        if self._sorted is None:
-            last = dict(zip(self.stamps, self.poses, strict=True))
-            stamps = sorted(last)
-            poses = np.array([last[stamp] for stamp in stamps]).reshape(-1, 4, 4)
-            self._sorted = (np.array(stamps, np.int64), poses)
-        return self._sorted
-
-
-def _between(first: np.ndarray, second: np.ndarray, ends: np.ndarray, stamp: int) -> np.ndarray:
-    share = float(stamp - ends[0]) / float(ends[1] - ends[0])
-    turn = Slerp([0, 1], Rotation.from_matrix([first[:3, :3], second[:3, :3]]))(share)
-    return rigid(turn.as_matrix(), (1 - share) * first[:3, 3] + share * second[:3, 3])
-
-
-@dataclass
-class TransformTree:
-    """Child frame -> its parent and where it is in it, over time or for ever (static)."""
-
-    moving: dict[str, tuple[str, PoseTrack]] = field(default_factory=dict)
-    static: dict[str, tuple[str, np.ndarray]] = field(default_factory=dict)
-
-    def add(self, transform: Any, static: bool) -> None:
-        """transform: geometry_msgs/TransformStamped."""
-        child, parent = _name(transform.child_frame_id), _name(transform.header.frame_id)
-        pose = _matrix(transform.transform.translation, transform.transform.rotation)
-        if static:
-            self.static[child] = (parent, pose)
-        else:
-            known = self.moving.get(child)
-            track = PoseTrack() if known is None or known[0] != parent else known[1]
-            self.moving[child] = (parent, track)
-            track.add(_nanoseconds(transform.header), pose)
-
-    def chain(self, frame: str) -> list[PoseTrack | np.ndarray]:
-        """What leads from a frame up to its root, the frame's own transform first."""
-        links: list[PoseTrack | np.ndarray] = []
-        seen = {frame}
-        while frame in self.moving or frame in self.static:
-            link: PoseTrack | np.ndarray
-            frame, link = self.moving[frame] if frame in self.moving else self.static[frame]
-            links.append(link)
-            if frame in seen:
-                raise PoseError(f"TF goes in a circle at {frame}")
-            seen.add(frame)
-        return links
-
-    def fixed(self, child: str, ancestor: str) -> np.ndarray | None:
-        """4 x 4, points of `child` -> `ancestor`, by static transforms alone; None without."""
-        pose, frame = np.eye(4), child
-        for _ in range(len(self.static) + 1):
-            if frame == ancestor:
-                return pose
-            if frame not in self.static:
-                return None
-            frame, link = self.static[frame]
-            pose = link @ pose
-        return None
-
-
-def _at(links: list[PoseTrack | np.ndarray], stamp_ns: int) -> np.ndarray | None:
-    pose = np.eye(4)
-    for link in links:
-        here = link.at(stamp_ns) if isinstance(link, PoseTrack) else link
-        if here is None:
-            return None
-        pose = here @ pose
-    return pose
-
-
 def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLookup:
     """Where the camera with this frame_id was when a frame of the recording was taken.
 
-    topic: PoseStamped or PoseWithCovarianceStamped (of the optical frame), Odometry (its child
-    frame must be the camera or be tied to it by static TF), or TFMessage; None: TF when it leads
-    from the camera to a root through something that moves, else the only pose or odometry topic.
-    "none" does without. An RGB-D folder has its own. Raises PoseError: no poses, several
-    candidates (listed), a topic that is absent or of another type.
+    The whole recording is read at once; PoseTopic reads it as a robot would have met it.
+
+    topic: PoseStamped or PoseWithCovarianceStamped (of the optical frame), Odometry or
+    TransformStamped (their child frame must be the camera or be tied to it by TF), or TFMessage;
+    None: TF when it leads from the camera to a root through something that moves, else the only
+    pose or odometry topic. "none" does without. An RGB-D folder has its own. Raises PoseError: no
+    poses, several candidates (listed), a topic that is absent or of another type.
     """
     if topic == NONE:
         raise PoseError("poses were not wanted")
@@ -149,78 +57,196 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
             raise PoseError(f"{path} holds no poses.txt or groundtruth.txt of its frames")
         return lambda index, stamp_ns: poses.get(stamp_ns)
     storage = open_storage(path)
-    kinds = {name: t.kind for name, t in storage.topics.items() if t.kind in POSE_KINDS and t.count}
-    tree = _read_tree(storage, kinds)
+    kinds = _kinds(storage)
+    transforms = TransformBuffer(_EVERYTHING)
+    for recorded in storage.messages([name for name, kind in kinds.items() if kind == TF]):
+        transforms.take(recorded.message(), recorded.topic.endswith(STATIC))
     if topic is not None and topic not in kinds:
         raise PoseError(f"{path}: no topic {topic} of poses, odometry or TF: {_listing(kinds)}")
-    if topic is None or kinds[topic] == TF:
-        links = tree.chain(_name(frame_id))
-        if any(isinstance(link, PoseTrack) for link in links):
-            return lambda index, stamp_ns: _at(links, stamp_ns)
-        if topic is not None:
-            raise PoseError(f"{path}: {topic} does not say where {frame_id!r} moves")
-    chosen = topic or _only(path, kinds)
-    track = _read_track(storage, chosen, kinds[chosen], _name(frame_id), tree)
-    return lambda index, stamp_ns: track.at(stamp_ns)
+    found = _by_transforms(path, frame_id, topic, kinds, transforms)
+    if found is None:
+        found = _by_topic(path, storage, topic or _only(path, kinds), kinds, transforms)
+        _check_tied(found, frame_id)
+
+    def lookup(index: int, stamp_ns: int) -> np.ndarray | None:
+        placed = found.at(stamp_ns, frame_id)
+        return None if placed is None else placed.pose
+
+    return lookup
 
 
-def _only(path: Path, kinds: dict[str, str]) -> str:
+def _by_transforms(
+    path: Path,
+    frame_id: str,
+    topic: str | None,
+    kinds: dict[str, str],
+    transforms: TransformBuffer,
+) -> CameraPoses | None:
+    """The camera in the root of its tree, when it moves there, and no other topic is named."""
+    if topic is not None and kinds[topic] != TF:
+        return None
+    frame = frame_id.lstrip("/")
+    try:
+        root = transforms.root(frame)
+        moves = root != frame and transforms.moves(root, frame)
+    except TransformError as error:
+        raise PoseError(f"{path}: {error}") from error
+    if moves:
+        options = OdometryOptions(odometry_type=TF, odom_frame=root)
+        return CameraPoses(options, "/tf", transforms, _quiet)
+    if topic is not None:
+        raise PoseError(f"{path}: {topic} does not say where {frame_id!r} moves")
+    return None
+
+
+def _by_topic(
+    path: Path, storage: Storage, topic: str, kinds: dict[str, str], transforms: TransformBuffer
+) -> CameraPoses:
+    options = OdometryOptions(odometry_type=kinds[topic])
+    poses = CameraPoses(options, topic, transforms, _quiet, _EVERYTHING)
+    for recorded in storage.messages([topic]):
+        poses.take(recorded.message())
+    if not poses.taken:
+        raise PoseError(f"{path}: {'; '.join(poses.lines()) or f'{topic} holds no pose'}")
+    return poses
+
+
+def _check_tied(poses: CameraPoses, frame_id: str) -> None:
+    if problem := poses.untied(frame_id):
+        raise PoseError(problem)
+
+
+def _quiet(text: str) -> None:
+    """What costs a cloud one frame is counted by its writer."""
+
+
+def _kinds(storage: Storage) -> dict[str, str]:
+    """The topics that hold poses or transforms: one of KINDS, or TF."""
+    short = {full: kind for kind, full in _TYPES.items()}
+    held = {name: topic.kind for name, topic in storage.topics.items() if topic.count}
+    return {name: short[full] for name, full in held.items() if full in short}
+
+
+def _only(path: Path, kinds: dict[str, str], option: str = "--pose-topic") -> str:
     candidates = {name: kind for name, kind in kinds.items() if kind != TF}
     if len(candidates) != 1:
-        problem = "several topics may be the pose; choose one with --pose-topic"
+        problem = f"several topics may be the pose; choose one with {option}"
         problem = problem if candidates else "no pose or odometry topic, and no TF to the camera"
         raise PoseError(f"{path}: {problem}: {_listing(candidates or kinds)}")
     return next(iter(candidates))
 
 
 def _listing(kinds: dict[str, str]) -> str:
-    return ", ".join(f"{name} ({kind})" for name, kind in sorted(kinds.items())) or "it has none"
+    named = (f"{name} ({_TYPES[kind]})" for name, kind in sorted(kinds.items()))
+    return ", ".join(named) or "it has none"
 
 
-def _read_tree(storage: Storage, kinds: dict[str, str]) -> TransformTree:
-    tree = TransformTree()
-    for recorded in storage.messages([name for name, kind in kinds.items() if kind == TF]):
-        for transform in recorded.message().transforms:
-            tree.add(transform, static=recorded.topic.endswith(STATIC))
-    return tree
+class PoseTopic:
+    """A recording's odometry and transforms, read in the order of recording as frames are met.
+
+    Static transforms count from the start, since the live topic is latched. A frame waits for
+    what was recorded up to `odometry_wait` seconds after it.
+
+    Attributes:
+        poses: Of the camera, with what was not used.
+        losses: Messages that could not be read, each reason with its count.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        options: OdometryOptions,
+        topic: str | None = None,
+        stamps: Literal["header", "log"] = "header",
+    ) -> None:
+        """Open the topics.
+
+        Args:
+            path: A recording of ROS messages.
+            options: Frames, and the type that is looked for.
+            topic: Of one of the types of OdometryOptions.odometry_type, or TFMessage; None: the
+                only one of that type, else the only one of any, else /tf.
+            stamps: Times of the headers, or of the log.
+
+        Raises:
+            PoseError: There is no such topic, or there are several.
+            ValueError: An option is wrong.
+        """
+        storage = open_storage(path)
+        kinds = _kinds(storage)
+        name, kind = _chosen(path, kinds, options, topic)
+        options = replace(options, odometry_type=kind)
+        self.losses: Counter[str] = Counter()
+        self.poses = CameraPoses(options, name, TransformBuffer(options.pose_limits), _quiet)
+        self._name, self._log_time = name, stamps == "log"
+        self._wait = round(options.odometry_wait * SECOND)
+        tf = [found for found, kind in kinds.items() if kind == TF]
+        if self.poses.wants_transforms:
+            for recorded in storage.messages([one for one in tf if one.endswith(STATIC)]):
+                self._take(recorded)
+        moving = {one for one in tf if not one.endswith(STATIC)}
+        wanted = ({name} - set(tf)) | (moving if self.poses.wants_transforms else set())
+        self._messages = storage.messages(wanted)
+        self._next: Recorded | None = next(self._messages, None)
+
+    def at(self, stamp: int, frame_id: str, log: int) -> Placed | None:
+        """The camera's pose at a frame; frames must come in order.
+
+        Args:
+            stamp: Nanoseconds, of the frame.
+            frame_id: The camera's frame.
+            log: Nanoseconds, when the frame was recorded.
+
+        Returns:
+            None when it is not known; `poses` then says why.
+        """
+        self._read(log)
+        while not self.poses.reaches(stamp, frame_id) and self._is_before(log + self._wait):
+            self._step()
+        return self.poses.at(stamp, frame_id)
+
+    def _read(self, log: int) -> None:
+        while self._is_before(log):
+            self._step()
+
+    def _is_before(self, log: int) -> bool:
+        return self._next is not None and self._next.log_ns <= log
+
+    def _step(self) -> None:
+        assert self._next is not None
+        recorded, self._next = self._next, next(self._messages, None)
+        self._take(recorded)
+
+    def _take(self, recorded: Recorded) -> None:
+        try:
+            message = recorded.message()
+        except RecordingError as error:
+            self.losses[str(error)] += 1
+            return
+        stamp = recorded.log_ns if self._log_time else None
+        if recorded.topic == self._name and self.poses.has_topic:
+            self.poses.take(message, stamp)
+        else:
+            self.poses.transforms.take(message, recorded.topic.endswith(STATIC), stamp)
 
 
-def _read_track(
-    storage: Storage, topic: str, kind: str, frame_id: str, tree: TransformTree
-) -> PoseTrack:
-    track = PoseTrack()
-    for recorded in storage.messages([topic]):
-        message = recorded.message()
-        pose = message.pose if kind == POSE else message.pose.pose
-        matrix = _matrix(pose.position, pose.orientation)
-        if kind == ODOMETRY:
-            matrix = matrix @ _mounting(topic, _name(message.child_frame_id), frame_id, tree)
-        track.add(_nanoseconds(message.header), matrix)
-    return track
-
-
-def _mounting(topic: str, body: str, camera: str, tree: TransformTree) -> np.ndarray:
-    """4 x 4: the camera's pose in the body that odometry is of."""
-    if (direct := tree.fixed(camera, body)) is not None:
-        return direct
-    if (other := tree.fixed(body, camera)) is not None:
-        return inverse(other)
-    raise PoseError(f"{topic} is of {body!r}, and no static TF ties it to the camera {camera!r}")
-
-
-def _matrix(position: Any, orientation: Any) -> np.ndarray:
-    q, p = orientation, position
-    try:
-        rotation = quaternion_rotation(q.w, q.x, q.y, q.z)
-    except ValueError as error:
-        raise PoseError(str(error)) from error
-    return rigid(rotation, np.array([p.x, p.y, p.z]))
-
-
-def _name(frame_id: str) -> str:
-    """Frame names of tf1 began with a slash."""
-    return str(frame_id).lstrip("/")
-
-
-def _nanoseconds(header: Any) -> int:
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+def _chosen(
+    path: Path, kinds: dict[str, str], options: OdometryOptions, topic: str | None
+) -> tuple[str, str]:
+    """Name and kind of the topic of poses."""
+    if topic is not None:
+        if topic not in kinds:
+            text = f"{path}: no topic {topic} of poses, odometry or TF: {_listing(kinds)}"
+            raise PoseError(text)
+        return topic, kinds[topic]
+    alike = {name: kind for name, kind in kinds.items() if kind == options.odometry_type}
+    others = {name: kind for name, kind in kinds.items() if kind != TF}
+    if options.odometry_type == TF or not others:
+        if not any(kind == TF for kind in kinds.values()):
+            raise PoseError(
+                f"{path}: metric_source is 'odometry', expected a topic of poses, odometry or TF: "
+                f"{_listing(kinds)}"
+            )
+        return "/tf", TF
+    name = _only(path, alike or others, "--odometry-topic")
+    return name, kinds[name]

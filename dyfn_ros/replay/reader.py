@@ -115,15 +115,18 @@ class SourceReader:
         """The camera's poses, from the first frame on.
 
         Args:
-            options: Whether they are wanted.
+            options: Whether they are wanted, what they are of, and where the camera is.
 
         Returns:
             None when the metric source is not odometry.
+
+        Raises:
+            RecordingError: The recording has no such topic.
+            ValueError: An option of the odometry is wrong.
         """
         if options.metric_source != "odometry":
             return None
-        source = self._source
-        return PoseFeed(source.recording, source.odometry_topic, source.odometry_noise)
+        return PoseFeed(self._source, options)
 
     def warn(self, reason: str, times: int = 1) -> None:
         """Note data that is there but could not be used."""

@@ -90,6 +90,8 @@ def stream_facts(run: Run) -> dict[str, Any]:
         "num_tokens": run.stream.num_tokens or None,
         "state_file": run.stream.state_file or None,
         "reference_transform": run.stream.reference_transform or None,
+        "moving_frame": run.stream.moving_frame or None,
+        "camera_pose": run.stream.camera_pose or None,
         "device": run.device,
     }
 

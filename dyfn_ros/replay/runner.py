@@ -83,13 +83,15 @@ class StreamRunner:
             if self._references is not None:
                 for when, reference in self._references.before(frame):
                     self._session.add_reference(when, reference)
+            placed = None if self._poses is None else self._poses.pose(frame)
             pushed = Frame(
                 frame.image,
                 stamp,
                 frame.camera_matrix,
                 frame.visible,
                 frame.frame_id,
-                None if self._poses is None else self._poses.pose(frame),
+                None if placed is None else placed.pose,
+                None if placed is None else placed.variance,
             )
             prediction = self._session.push(pushed)
             yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
@@ -109,12 +111,15 @@ class StreamRunner:
         found: dict[str, Any] = {"resets": dict(self._session.resets)}
         if self._run.stream.metric_source != "none":
             found["metric_scale"] = self._session.scale.described()
+        if self._poses is not None and (facts := self._poses.facts()):
+            found["odometry"] = facts
         return {**found, **({"state": self._state} if self._state else {})}
 
     def warnings(self) -> dict[str, int]:
         """What a user should look at, with how often."""
         found = dict.fromkeys(self._session.problems(), 1)
         if self._poses is not None:
+            found |= self._poses.warnings()
             for reason, count in sorted(self._session.unused_references.items()):
                 found[f"odometry: frames without points: {reason}"] = count
         if self._references is None:
@@ -127,8 +132,9 @@ class StreamRunner:
         return found
 
     def losses(self) -> dict[str, int]:
-        """Measurements that could not be read, with how often."""
-        return {} if self._references is None else dict(self._references.topic.losses)
+        """Measurements and poses that could not be read, with how often."""
+        found = {} if self._poses is None else self._poses.losses()
+        return found | ({} if self._references is None else dict(self._references.topic.losses))
 
 
 def _check_folder(state_file: str) -> None:

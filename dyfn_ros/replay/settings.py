@@ -15,6 +15,7 @@ from dyfn_core.metric.odometry_noise import OdometryNoise
 from dyfn_core.quantities import DEPTH
 from dyfn_core.stream.options import StreamOptions
 from dyfn_core.threads import THREADS
+from dyfn_ros.messages.odometry_options import OdometryOptions
 from dyfn_ros.messages.reference_options import ReferenceOptions
 
 MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
@@ -37,7 +38,7 @@ class Source:
         depth_info_topic: CameraInfo of a depth camera that is not the image's.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
-        odometry_topic: Poses for metric_source "odometry", see recordings.poses.open_poses.
+        odometry_topic: Poses for metric_source "odometry", see recordings.poses.PoseTopic.
         odometry_noise: Errors that are added to them; None: none.
         stamps: Times of the headers, or of the log.
         tolerance: Seconds between the stamps of an image and its ground truth.
@@ -61,8 +62,8 @@ class Source:
 
 
 @dataclass(frozen=True)
-class SessionOptions(ReferenceOptions, StreamOptions):
-    """The node's options of a stream and of its reference, with the node's defaults."""
+class SessionOptions(OdometryOptions, ReferenceOptions, StreamOptions):
+    """The node's options of a stream, its reference and its odometry, with the node's defaults."""
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,10 @@ ABOVE = {
 }
 # Packages from outside -> where they may be imported: "package" or "package.room".
 RCLPY, BAGS = ("rclpy",), ("rosbags", "mcap", "apsw")
-ROS_TYPES = ("sensor_msgs", "std_msgs", "std_srvs", "geometry_msgs", "diagnostic_msgs")
+ROS_TYPES = (
+    *("sensor_msgs", "std_msgs", "std_srvs", "geometry_msgs", "diagnostic_msgs"),
+    *("nav_msgs", "tf2_msgs"),
+)
 HOMES: dict[tuple[str, ...], set[str]] = {
     RCLPY: {"dyfn_ros.node", "dyfn_ros.demo"},
     BAGS: {"dyfn_ros.recordings"},

@@ -9,7 +9,8 @@ import pytest
 
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 from dyfn_core.metric import pose_history as reasons
-from dyfn_core.metric.pose_history import NoPose, Placed, PoseHistory, PoseLimits
+from dyfn_core.metric.pose_history import NoPose, Placed, PoseHistory
+from dyfn_core.metric.pose_limits import PoseLimits
 
 START = 1_700_000_000_000_000_000  # float64 seconds would be 240 ns off here
 

@@ -10,8 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from dyfn_core.geometry.rigid import between, inverse
+from dyfn_ros.recordings.open import open_recording
+from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL, UNUSABLE
+from tests.support.odometry import MOUNT, SECOND, odometry, pose_text
 from tests.support.pinhole import FOV_X, PinholeModel
 from tests.support.textured_plane import CAMERA, SIZE, plane_view, texture, walk
 
@@ -59,6 +63,60 @@ def test_poses_of_a_folder_give_metres(folder: Path, tmp_path: Path) -> None:
     metric = rows[0].split(",").index("metric_abs_rel")
     known = [bool(row.split(",")[metric]) for row in rows[1:]]
     assert not any(known[:35]) and all(known[45:])
+
+
+def drive(folder: Path, path: Path, offset: float = 0.0) -> Path:
+    """The folder as a bag, its poses as a base's odometry between the images.
+
+    offset: seconds of the odometry's clock.
+    """
+    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4) @ inverse(MOUNT)
+    path.parent.mkdir(exist_ok=True)
+    with RecordingWriter(path) as writer:
+        for index, frame in enumerate(open_recording(folder).frames()):
+            stamp, name = frame.stamp_ns, "camera_optical"
+            assert frame.depth is not None
+            writer.write_png("/camera/image", frame.image, stamp, name)
+            writer.write_depth("/camera/depth", frame.depth, stamp, name)
+            writer.write_camera_info("/camera/camera_info", OWN_CAMERA, SIZE, stamp, name)
+            here = between(poses[index], poses[min(index + 1, len(poses) - 1)], 0.5)
+            when = stamp / SECOND + 0.05
+            message = odometry(here, when + offset)
+            writer.write("/odom", "nav_msgs/msg/Odometry", message, round(when * SECOND))
+    return path
+
+
+def test_odometry_of_a_bag_gives_metres(folder: Path, tmp_path: Path) -> None:
+    bag = drive(folder, tmp_path / "walk.mcap")
+    options = ("--metric-source", "odometry", "--camera-pose", pose_text(MOUNT))
+    found = run(bag, tmp_path / "out", *options)
+    assert found["metric"]["abs_rel"] < 0.05
+    assert found["odometry"]["frames"] == "base_link in odom"
+    assert found["odometry"]["camera's place"] == "camera_pose"
+    assert found["odometry"]["images with a pose"] == "60"
+
+
+@pytest.mark.parametrize(
+    ("offset", "options", "words"),
+    [
+        (77.0, ("--camera-pose", pose_text(MOUNT)), ("another clock", "77 s younger")),
+        (0.0, (), ("'base_link'", "'camera_optical'", "set camera_pose")),
+    ],
+)
+def test_odometry_that_cannot_be_used_is_named_and_depth_goes_on(
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    offset: float,
+    options: tuple[str, ...],
+    words: tuple[str, ...],
+) -> None:
+    bag = drive(folder, tmp_path / "walk.mcap", offset)
+    found = run(bag, tmp_path / "out", "--metric-source", "odometry", *options)
+    warnings = capsys.readouterr().err
+    assert found["coverage"] == 1.0 and found["metric_scale"]["unit"] == "relative"
+    for word in ("/odom: images without a pose", "(60 times)", *words):
+        assert word in warnings
 
 
 def test_noise_is_drawn_from_its_seed(folder: Path, tmp_path: Path) -> None:

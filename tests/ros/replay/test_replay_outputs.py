@@ -19,7 +19,7 @@ from dyfn_core.geometry.camera import normalize_intrinsics
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 from dyfn_core.prediction import Prediction
 from dyfn_ros.recordings.open import open_recording
-from dyfn_ros.recordings.poses import ODOMETRY, PoseError, open_poses
+from dyfn_ros.recordings.poses import PoseError, open_poses
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording as record
 from dyfn_ros.recordings.typestore import TYPES, header
@@ -246,6 +246,9 @@ def test_a_full_disk_leaves_no_half_rerun_recording(
     assert next(room, None) is None
 
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
 def odometry(path: Path, tie: bool) -> None:
     """A base that moves along x, with a camera 0.5 m ahead of it that looks forward."""
     types = TYPES.types
@@ -283,7 +286,7 @@ def test_odometry_is_carried_to_the_camera(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-9)
     assert where(0, 410_000_000) is not None and where(0, 500_000_000) is None
     odometry(tmp_path / "odo", tie=False)
-    with pytest.raises(PoseError, match="no static TF ties it to the camera"):
+    with pytest.raises(PoseError, match="is of 'base', the images are of 'camera_optical'"):
         open_poses(tmp_path / "odo", "camera_optical")
 
 
