@@ -218,17 +218,10 @@ class SequenceEvaluation:
                 for name, value in zip(names, values, strict=True)
             }
 
-    @property
-    def in_metres(self) -> bool:
-        """Whether every frame was in metres."""
-        return 0 < self.metric_frames == self.frames
-
     def shown_frames(self) -> ShownFrames:
-        """The strip's frames: in metres as they are, else aligned as the video protocol does."""
+        """The strip's frames, aligned as the video protocol does."""
         video = self.video()
-        if video is None or self.in_metres:
-            return self.strip.shown()
-        return self.strip.shown(video.scale, video.shift)
+        return self.strip.shown() if video is None else self.strip.shown(video.scale, video.shift)
 
     def draw_strip(self) -> np.ndarray:
         """The strip of shown_frames (H x W x 3 uint8 RGB)."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import cv2
@@ -29,6 +31,7 @@ class SmallFrame:
     NaN where invalid. solid: h x w bool, valid and on no depth edge.
     truth: h x w float32 metres, NaN invalid; None without. matrix: 3 x 3 pixels of this grid.
     pose: 4 x 4 camera to world, metres; None when unknown.
+    base: predicted and solid of the base model's run; None when it was not run.
     """
 
     stamp_ns: int
@@ -38,25 +41,66 @@ class SmallFrame:
     truth: np.ndarray | None
     matrix: np.ndarray
     pose: np.ndarray | None
+    base: tuple[np.ndarray, np.ndarray] | None = None
+
+
+class _Arrays:
+    """Tuples of arrays in a file without a name in `folder`, which goes away with the process."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by close
+        self.count = 0
+
+    def close(self) -> None:
+        self._file.close()
+
+    def push(self, *arrays: np.ndarray) -> None:
+        try:
+            self._file.seek(0, os.SEEK_END)
+            for array in arrays:
+                np.save(self._file, array, allow_pickle=False)
+            self._file.flush()
+        except OSError as error:
+            raise cannot_write(self._folder / "(copies of frames)", error) from error
+        self.count += 1
+
+    def read(self, size: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """Every tuple of this many arrays, in order."""
+        place = 0
+        for _ in range(self.count):
+            self._file.seek(place)
+            arrays = tuple(np.load(self._file) for _ in range(size))
+            place = self._file.tell()
+            yield arrays
 
 
 class FrameSpool:
     """Frames go in once and can be read again in order, any number of times.
 
-    They are in a file without a name in `folder`, which goes away with the process. Raises
-    OutputError when it cannot be written.
+    The base model's run of the same frames may follow. Raises OutputError when the files, which
+    are in `folder`, cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by __exit__
-        self.frames = 0
+        self._arrays, self._base = _Arrays(folder), _Arrays(folder)
 
     def __enter__(self) -> FrameSpool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self._arrays.close()
+        self._base.close()
+
+    @property
+    def frames(self) -> int:
+        """How many frames it holds."""
+        return self._arrays.count
+
+    @property
+    def has_base(self) -> bool:
+        """Whether the base model's run is there."""
+        return self._base.count > 0
 
     def push(
         self, frame: RecordedFrame, prediction: Prediction[np.ndarray], pose: np.ndarray | None
@@ -64,7 +108,7 @@ class FrameSpool:
         """Keep a frame, small."""
         small = shrink(frame, prediction, pose)
         missing = np.empty(0)
-        arrays = (
+        self._arrays.push(
             np.array(small.stamp_ns),
             small.image,
             small.predicted,
@@ -73,22 +117,14 @@ class FrameSpool:
             small.matrix,
             missing if small.pose is None else small.pose,
         )
-        try:
-            for array in arrays:
-                np.save(self._file, array, allow_pickle=False)
-            self._file.flush()
-        except OSError as error:
-            raise cannot_write(self._folder / "(copies of frames)", error) from error
-        self.frames += 1
+
+    def push_base(self, prediction: Prediction[np.ndarray]) -> None:
+        """Keep what the base model predicts of the next frame, small."""
+        self._base.push(*_small_depth(prediction))
 
     def __iter__(self) -> Iterator[SmallFrame]:
-        place = 0
-        for _ in range(self.frames):
-            self._file.seek(place)
-            stamp, image, predicted, solid, truth, matrix, pose = (
-                np.load(self._file) for _ in range(7)
-            )
-            place = self._file.tell()
+        frames = zip_longest(self._arrays.read(7), self._base.read(2))
+        for (stamp, image, predicted, solid, truth, matrix, pose), base in frames:
             yield SmallFrame(
                 int(stamp),
                 image,
@@ -97,6 +133,7 @@ class FrameSpool:
                 truth if truth.size else None,
                 matrix,
                 pose if pose.size else None,
+                None if base is None else (base[0], base[1]),
             )
 
 
@@ -105,15 +142,25 @@ def shrink(
 ) -> SmallFrame:
     """Every s-th row and column from s // 2, s the smallest that gives at most MAX_SIDE of them."""
     shape = prediction.depth.shape
-    step = math.ceil(max(shape) / MAX_SIDE)
-    grid = (slice(step // 2, None, step),) * 2
-    predicted, valid = prediction.aligned_quantity
-    known = valid & np.isfinite(prediction.depth) & (prediction.depth > 0)
-    solid = known & ~flying_pixels(prediction.depth, known, EDGE)
+    step, grid = _grid(shape)
+    predicted, solid = _small_depth(prediction)
     matrix = prediction.camera_matrix.astype(np.float64).copy()
     matrix[:2, 2] -= step // 2
     matrix[:2] /= step
-    small = np.where(valid, predicted, np.nan).astype(np.float32)[grid]
     truth = None if frame.depth is None else to_shape(frame.depth, shape)[grid].astype(np.float32)
-    image = cv2.resize(frame.image, small.shape[::-1], interpolation=cv2.INTER_AREA)
-    return SmallFrame(frame.stamp_ns, image, small, solid[grid], truth, matrix, pose)
+    image = cv2.resize(frame.image, predicted.shape[::-1], interpolation=cv2.INTER_AREA)
+    return SmallFrame(frame.stamp_ns, image, predicted, solid, truth, matrix, pose)
+
+
+def _grid(shape: tuple[int, ...]) -> tuple[int, tuple[slice, slice]]:
+    step = math.ceil(max(shape) / MAX_SIDE)
+    return step, (slice(step // 2, None, step),) * 2
+
+
+def _small_depth(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """What is aligned, and where it is valid and on no depth edge, as in SmallFrame."""
+    _, grid = _grid(prediction.depth.shape)
+    predicted, valid = prediction.aligned_quantity
+    known = valid & np.isfinite(prediction.depth) & (prediction.depth > 0)
+    solid = known & ~flying_pixels(prediction.depth, known, EDGE)
+    return np.where(valid, predicted, np.nan).astype(np.float32)[grid], solid[grid]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -10,17 +10,19 @@ from typing import Protocol
 
 import numpy as np
 
+from dyfn_core.evaluation.report.cloud_view import CloudView
 from dyfn_core.files import cannot_write
-from dyfn_core.prediction import DEPTH, Prediction
+from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.recordings.poses import PoseError, PoseLookup, open_poses
-from dyfn_ros.replay.cloud import write_cloud
+from dyfn_ros.replay.cloud import FusedCloud, cloud_view, write_cloud
 from dyfn_ros.replay.frame_spool import FrameSpool
 from dyfn_ros.replay.mcap import ReplayRecording
 from dyfn_ros.replay.rerun import RerunRecording
 from dyfn_ros.replay.settings import FILES, MCAP, NONE, PLY, RRD, VIDEO, Outputs
-from dyfn_ros.replay.video import Alignment, write_video
+from dyfn_ros.replay.shown_run import ShownRun
+from dyfn_ros.replay.video import write_video
 
 
 class _Writer(Protocol):
@@ -34,8 +36,8 @@ class ReplayOutputs:
 
     options: folder, files and their parameters. recording: what is replayed; its poses are looked
     for in it. warn: takes a reason for what is not written, or not whole. After an exception none
-    of the files is left behind. cloud: after finish, the fused cloud seen from above (H x W x 3
-    uint8 RGB), if there is one. Raises OutputError for a file that cannot be written, or a library
+    of the files is left behind. cloud: after finish, clouds for the report, if copies of the
+    frames were kept. Raises OutputError for a file that cannot be written, or a library
     that is missing.
     """
 
@@ -54,7 +56,7 @@ class ReplayOutputs:
         self._fuse = PLY in options.write
         self._done = {MCAP, RRD} & set(options.write)
         self._stack = ExitStack()
-        self.cloud: np.ndarray | None = None
+        self.cloud: CloudView | None = None
 
     def __enter__(self) -> ReplayOutputs:
         with ExitStack() as stack:
@@ -97,29 +99,40 @@ class ReplayOutputs:
             pose = self._pose(frame) if self._fuse else None
             self._spool.push(frame, prediction, pose)
 
-    def finish(self, alignment: Alignment | None, quantity: str = DEPTH) -> None:
-        """Write what needs the alignment of the whole sequence; None when there is no truth.
+    def write_base(self, prediction: Prediction[np.ndarray]) -> None:
+        """What the base model predicts of the next frame, in order, after all of write."""
+        if self._spool is not None:
+            self._spool.push_base(prediction)
 
-        quantity: what the model predicts, depth or disparity.
+    def finish(self, runs: Sequence[ShownRun]) -> None:
+        """Write what needs the alignment of the whole sequence.
+
+        Args:
+            runs: The run; and the base model's, where write_base took it.
         """
-        spool = self._spool
-        if spool is not None and spool.frames and VIDEO in self._options.write:
-            unaligned = Alignment(quantity=quantity)
-            write_video(self._folder / FILES[VIDEO], spool, alignment or unaligned)
-            self._done.add(VIDEO)
-        if spool is not None and spool.frames and self._fuse:
-            self._write_cloud(spool, alignment)
+        spool, fused = self._spool, None
+        if spool is not None and spool.frames:
+            if VIDEO in self._options.write:
+                write_video(self._folder / FILES[VIDEO], spool, runs)
+                self._done.add(VIDEO)
+            if self._fuse:
+                fused = self._write_cloud(spool, runs[0])
+            options = self._options
+            self.cloud = cloud_view(spool, fused, runs, options.voxel, options.depth_max)
         for note in self._notes:
             self._warn(note)
 
-    def _write_cloud(self, spool: FrameSpool, alignment: Alignment | None) -> None:
+    def _write_cloud(self, spool: FrameSpool, run: ShownRun) -> FusedCloud | None:
         path, options = self._folder / FILES[PLY], self._options
-        if alignment is None:
-            note = "no cloud.ply: depth is up to scale, and no ground truth gives its metres"
-        else:
-            self.cloud, note = write_cloud(path, spool, alignment, options.voxel, options.depth_max)
-            self._done.add(PLY)
+        if not run.alignment.metres:
+            self._notes.append(
+                "no cloud.ply: depth is up to scale, and no ground truth gives its metres"
+            )
+            return None
+        fused, note = write_cloud(path, spool, run.alignment, options.voxel, options.depth_max)
+        self._done.add(PLY)
         self._notes += [note] if note else []
+        return fused
 
     def _pose(self, frame: RecordedFrame) -> np.ndarray | None:
         """Poses are opened with the first frame, which knows the camera's frame_id."""

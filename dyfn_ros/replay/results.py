@@ -9,8 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from dyfn_core.evaluation.report.cloud_view import CloudView
 from dyfn_core.evaluation.report.html import Section, Table, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
@@ -36,7 +35,7 @@ class Result:
         evaluation: Of every frame.
         base: Of the same frames without DyFN; None: not run.
         options: What the run adds to the `options` of metrics.json.
-        cloud: Picture of the fused cloud, H x W x 3 uint8 RGB; None: no cloud.
+        cloud: Clouds for the report; None: no cloud.
         stream: What metrics.json has of the stream session.
     """
 
@@ -45,7 +44,7 @@ class Result:
     evaluation: SequenceEvaluation
     base: SequenceEvaluation | None
     options: dict[str, Any]
-    cloud: np.ndarray | None
+    cloud: CloudView | None
     stream: dict[str, Any] = field(default_factory=dict)
 
 
@@ -135,9 +134,9 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     if result.base is not None:
         base = run_name({**metrics, "stabilizer": False})
         runs[base] = result.base
-    clouds = {} if result.cloud is None else {f"{name}, fused, from above": result.cloud}
     controlled = result.evaluation.controls.keys() > CONTROLS.keys()
-    sections = sequence_sections(runs, clouds, CONTROLS_NOTE if controlled else "", base=base)
+    note = CONTROLS_NOTE if controlled else ""
+    sections = sequence_sections(runs, note=note, base=base, cloud=result.cloud)
     if notes:
         rows = [[text, count] for text, count in notes.items()]
         sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))

@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
 
+from dyfn_core.evaluation.report.variants import over_median
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.controls import latent_controls, stabilized_by
 from dyfn_core.prediction import Prediction
+from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.threads import computing_threads
+from dyfn_ros.recordings.frames import RecordedFrame
 from dyfn_ros.replay.outputs import ReplayOutputs
 from dyfn_ros.replay.reader import SourceReader
 from dyfn_ros.replay.results import Result, write_results
 from dyfn_ros.replay.runner import StreamRunner
 from dyfn_ros.replay.scores import push_frame
 from dyfn_ros.replay.settings import Outputs, Run, Source
-from dyfn_ros.replay.video import Alignment
+from dyfn_ros.replay.shown_run import Alignment, ShownRun
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
+Write = Callable[[RecordedFrame, "Prediction[np.ndarray]", FrameScore], None]
 ModelLoader = Callable[[str, str], "GeometryModel"]  # name, device
 
 
@@ -63,13 +66,18 @@ def replay(
     with computing_threads(run.threads) as threads:
         runner = _runner(reader, run, model)
         files = ReplayOutputs(outputs, source.recording, reader.warn)
-        evaluation = _evaluate(reader, runner, model, outputs, files)
-        reader.require(evaluation.frames)
-        runner.finish()
         base = None
-        if run.compare and stabilized:
-            base = _variant(source, run.without_dyfn(), model, outputs)
-        elif run.compare:
+        with files:
+            evaluation = _evaluate(reader, runner, model, outputs, files.write)
+            reader.require(evaluation.frames)
+            name = "with DyFN" if stabilized else "base model"
+            runs = [_shown(name, evaluation, runner.metres_per_unit)]
+            if run.compare and stabilized:
+                base = _variant(source, run.without_dyfn(), model, outputs, files)
+                runs.append(_shown("base model", base, None))
+            files.finish(runs)
+        runner.finish()
+        if run.compare and not stabilized:
             reader.warn(f"--compare: {run.model} ran without DyFN, there is nothing to compare")
         if run.controls:
             evaluation.controls |= _controls(source, run, model, outputs)
@@ -105,9 +113,9 @@ def _evaluate(
     runner: StreamRunner,
     model: GeometryModel,
     outputs: Outputs,
-    files: ReplayOutputs | None = None,
+    write: Write,
 ) -> SequenceEvaluation:
-    """Every frame read, run and scored; written too where there are files."""
+    """Every frame read, run and scored; `write` takes it too."""
     evaluation = SequenceEvaluation(reader.expected, outputs.depth_max, model.quantity)
     frames = tqdm(
         reader.frames(),
@@ -116,22 +124,18 @@ def _evaluate(
         file=sys.stderr,
         disable=not outputs.progress,
     )
-    with files or nullcontext():
-        for one in runner.frames(frames):
-            score = push_frame(
-                evaluation,
-                reader,
-                one.frame,
-                _output(one.prediction),
-                one.stamp,
-                one.latency,
-                one.prediction.metric,
-                one.prediction.aligned_quantity,
-            )
-            if files is not None:
-                files.write(one.frame, one.prediction, score)
-        if files is not None:
-            files.finish(_alignment(evaluation, runner.metres_per_unit), model.quantity)
+    for one in runner.frames(frames):
+        score = push_frame(
+            evaluation,
+            reader,
+            one.frame,
+            _output(one.prediction),
+            one.stamp,
+            one.latency,
+            one.prediction.metric,
+            one.prediction.aligned_quantity,
+        )
+        write(one.frame, one.prediction, score)
     for loss, count in runner.losses().items():
         reader.recording.notes.losses[loss] += count
     for warning, count in runner.warnings().items():
@@ -146,24 +150,39 @@ def _output(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]
     return prediction.depth, prediction.valid
 
 
-def _alignment(evaluation: SequenceEvaluation, metres_per_unit: float | None) -> Alignment | None:
+def _shown(name: str, evaluation: SequenceEvaluation, metres_per_unit: float | None) -> ShownRun:
+    scales = over_median(evaluation.column("scale"))
+    return ShownRun(name, _alignment(evaluation, metres_per_unit), scales)
+
+
+def _alignment(evaluation: SequenceEvaluation, metres_per_unit: float | None) -> Alignment:
     """What brings all frames into metres: the truth's alignment, else their own scale."""
     video = evaluation.video()
     if video is not None:
         return Alignment(video.scale, video.shift, evaluation.quantity, metres=True)
+    unaligned = Alignment(quantity=evaluation.quantity)
     if metres_per_unit is None or not evaluation.metric_frames:
-        return None
+        return unaligned
     steady = metres_per_unit != 1.0 or evaluation.metric_frames == evaluation.frames
-    return Alignment(metres_per_unit, metres=True) if steady else None
+    return Alignment(metres_per_unit, metres=True) if steady else unaligned
 
 
 def _variant(
-    source: Source, run: Run, model: GeometryModel, outputs: Outputs
+    source: Source,
+    run: Run,
+    model: GeometryModel,
+    outputs: Outputs,
+    files: ReplayOutputs | None = None,
 ) -> SequenceEvaluation:
-    """The same frames in another run; nothing but its evaluation is kept."""
+    """The same frames in another run; its evaluation is kept, and its depth in files."""
     reader = SourceReader(source)
     runner = _runner(reader, run, model)
-    return _evaluate(reader, runner, model, outputs)
+
+    def write(_: RecordedFrame, prediction: Prediction[np.ndarray], __: FrameScore) -> None:
+        if files is not None:
+            files.write_base(prediction)
+
+    return _evaluate(reader, runner, model, outputs, write)
 
 
 def _controls(

@@ -1,19 +1,20 @@
-"""The MP4 of a replay: input, depth and error side by side, in colours that stay the same."""
+"""The MP4 of a replay: input, truth, base and result, in colours that stay the same; the scale."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from dyfn_core.evaluation.report.pictures import MAX_ERROR, colour_depth, colour_error, depth_range
+from dyfn_core.evaluation.report.frame_grid import depth_bar, draw_bars, error_bar
+from dyfn_core.evaluation.report.pictures import colour_depth, colour_error, depth_range
 from dyfn_core.files import OutputError, finished_file
-from dyfn_core.scoring.protocols import align_depth
 from dyfn_ros.replay.frame_spool import FrameSpool, SmallFrame
+from dyfn_ros.replay.scale_curve import ScaleCurve
+from dyfn_ros.replay.shown_run import ShownRun
 
 CODEC = "libx264"
 TICKS = 1000  # of a second; the time base
@@ -22,31 +23,16 @@ RANGE_FRAMES = 32  # frames that the range of colours is of
 USUAL_STEP, LONGEST_STEP = 0.1, 1.0  # seconds a frame is shown when stamps go back, and at most
 
 
-@dataclass(frozen=True)
-class Alignment:
-    """How predictions become one depth for the whole recording.
-
-    Attributes:
-        scale, shift: Of the video protocol; 1 and 0 without truth.
-        quantity: What is aligned.
-        metres: Whether the aligned depth is in metres; else it is right up to scale.
-    """
-
-    scale: float = 1.0
-    shift: float = 0.0
-    quantity: str = "depth"
-    metres: bool = False
-
-    def depth(self, predicted: np.ndarray) -> np.ndarray:
-        """H x W depth or disparity, as predicted -> aligned depth."""
-        return align_depth(predicted, self.scale, self.shift, self.quantity)
-
-
-def write_video(path: Path, spool: FrameSpool, alignment: Alignment) -> None:
+def write_video(path: Path, spool: FrameSpool, runs: Sequence[ShownRun]) -> None:
     """H.264 of all frames at the pace of their stamps.
 
-    One alignment and one range of colours for all frames, so that drift and flicker are seen;
-    the error panel is there when any frame has truth. Raises OutputError.
+    One alignment for each run and one range of colours for all frames, so that drift and flicker
+    are seen; truth, errors and scale are there when any frame has truth. Raises OutputError.
+
+    Args:
+        path: The file; it appears only when it is complete.
+        spool: The frames.
+        runs: The run, and the base model's where the spool has it.
     """
     try:
         import av  # loads ffmpeg's libraries: not for --help
@@ -55,14 +41,14 @@ def write_video(path: Path, spool: FrameSpool, alignment: Alignment) -> None:
             f"--write video needs PyAV ({error}): install this package with its `video` extra"
         ) from error
 
-    colours = _Colours(spool, alignment)
+    panels = _Panels(spool, runs)
     with (
         finished_file(path) as partial,
         av.open(str(partial), "w", "mp4", options={"movflags": "faststart"}) as container,
     ):
         stream = None
-        for time, frame in _timed(spool):
-            picture = colours.draw(frame)
+        for number, (time, frame) in enumerate(_timed(spool)):
+            picture = panels.draw(number, frame)
             if stream is None:
                 stream = container.add_stream(CODEC, options={"crf": "20", "preset": "veryfast"})
                 stream.height, stream.width = picture.shape[:2]
@@ -95,34 +81,78 @@ def _fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.ascontiguousarray(picture)
 
 
-class _Colours:
+class _Panels:
     """Draws frames with the range of colours that a first pass over them found."""
 
-    def __init__(self, spool: FrameSpool, alignment: Alignment) -> None:
-        self._alignment = alignment
+    def __init__(self, spool: FrameSpool, runs: Sequence[ShownRun]) -> None:
+        self._runs = list(runs[: 2 if spool.has_base else 1])
+        self._factors = [1.0] * len(self._runs)
         every = max(1, spool.frames // RANGE_FRAMES)
-        truths, depths = [], []
+        truths: list[np.ndarray] = []
+        depths: list[list[np.ndarray]] = [[] for _ in self._runs]
+        stamps = []
         for index, frame in enumerate(spool):
+            stamps.append(frame.stamp_ns)
             if index % every == 0:
-                depths.append(alignment.depth(frame.predicted))
+                for found, depth in zip(depths, self._depths(frame), strict=True):
+                    found.append(depth)
                 truths += [] if frame.truth is None else [frame.truth]
-        self._error = bool(truths)
-        self._near, self._far = depth_range(truths or depths)
+        unit = "depth, m"
+        if not all(run.alignment.metres for run in self._runs):
+            self._factors = [1 / _median(found) for found in depths]
+            depths = [
+                [d * f for d in found] for found, f in zip(depths, self._factors, strict=True)
+            ]
+            unit = "depth over its median (up to scale)"
+        self._truth = bool(truths)
+        self._near, self._far = depth_range(truths or [d for found in depths for d in found])
+        self._bars = [depth_bar(self._near, self._far, unit)]
+        self._curve: ScaleCurve | None = None
+        if self._truth:
+            self._bars.append(error_bar())
+            lines = {run.name: run.scales for run in self._runs}
+            self._curve = ScaleCurve(lines, (np.array(stamps) - stamps[0]) / 1e9)
 
-    def draw(self, frame: SmallFrame) -> np.ndarray:
-        """Rows and columns x 3 uint8 RGB, both even as yuv420p asks for."""
-        depth = self._alignment.depth(frame.predicted)
-        panels = {"input": frame.image}
-        unit = "m" if self._alignment.metres else "(up to scale)"
-        panels[f"depth {self._near:.2g} to {self._far:.2g} {unit}"] = colour_depth(
-            depth, self._near, self._far
-        )
-        if self._error:
-            truth = np.full(depth.shape, np.nan) if frame.truth is None else frame.truth
-            panels[f"error 0 to {MAX_ERROR:.0%}"] = colour_error(depth, truth)
-        drawn = np.hstack([_captioned(name, panel) for name, panel in panels.items()])
-        rows, columns = drawn.shape[0] % 2, drawn.shape[1] % 2
-        return np.pad(drawn, ((0, rows), (0, columns), (0, 0)))
+    def _depths(self, frame: SmallFrame) -> list[np.ndarray]:
+        """Aligned depth of each run, NaN where there is none."""
+        found = [frame.predicted, *([] if frame.base is None else [frame.base[0]])]
+        nothing = np.full(frame.predicted.shape, np.nan, np.float32)
+        found += [nothing] * (len(self._runs) - len(found))
+        return [
+            run.alignment.depth(predicted) * factor
+            for run, predicted, factor in zip(self._runs, found, self._factors, strict=True)
+        ]
+
+    def draw(self, number: int, frame: SmallFrame) -> np.ndarray:
+        """Rows and columns x 3 uint8 RGB, both even as yuv420p asks for.
+
+        Above: input, truth, base, result; below, with truth: the scale so far, and the errors.
+        """
+        depths = dict(zip([run.name for run in self._runs], self._depths(frame), strict=True))
+        ordered = dict(reversed(depths.items()))  # the base, then the result
+        above = {"input": frame.image}
+        below: list[np.ndarray] = []
+        if self._curve is not None:
+            truth = np.full(frame.image.shape[:2], np.nan) if frame.truth is None else frame.truth
+            above["ground truth"] = self._paint(truth)
+            height, width = frame.image.shape[:2]
+            below.append(self._curve.draw(number, (height + BAR, 2 * width)))
+            for name, depth in ordered.items():
+                below.append(_captioned(f"error, {name}", colour_error(depth, truth)))
+        above |= {name: self._paint(depth) for name, depth in ordered.items()}
+        rows = [np.hstack([_captioned(name, panel) for name, panel in above.items()])]
+        rows += [np.hstack(below)] if below else []
+        drawn = np.vstack([*rows, draw_bars(self._bars, rows[0].shape[1])])
+        odd = drawn.shape[0] % 2, drawn.shape[1] % 2
+        return np.pad(drawn, ((0, odd[0]), (0, odd[1]), (0, 0)))
+
+    def _paint(self, depth: np.ndarray) -> np.ndarray:
+        return colour_depth(depth, self._near, self._far)
+
+
+def _median(depths: Sequence[np.ndarray]) -> float:
+    values = np.concatenate([d[np.isfinite(d) & (d > 0)] for d in depths])
+    return float(np.median(values)) if values.size else 1.0
 
 
 def _captioned(name: str, panel: np.ndarray) -> np.ndarray:

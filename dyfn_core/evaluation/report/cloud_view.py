@@ -16,7 +16,7 @@ from dyfn_core.evaluation.reconstruction.cloud_pictures import CEILING, draw_fus
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.geometry.registration import Similarity
 
-POINTS = 36_000  # of all clouds of a view; 9 bytes each
+POINTS = 45_000  # of all clouds of a view; 9 bytes each
 STEPS = 65_535  # a coordinate has 16 bits
 ROOM = 0.25  # of the box, beyond the inner 98 % of the points in each direction
 PATH_POINTS = 400

@@ -96,16 +96,10 @@ def curves_html(part: Curves) -> str:
             f'stroke-dasharray="{dashes[name]}" d="{path}"/>'
         )
     drawn.append(f'<line class="cursor" y1="{TOP}" y2="{BOTTOM}"/>')
-    data = {
-        "label": part.x_label,
-        "ends": [start, end],
-        "box": {"left": LEFT, "right": RIGHT, "width": WIDTH},
-        "lines": [
-            {"name": name, "points": [[_short(x), _short(y)] for run in runs for x, y in run]}
-            for name, runs in lines.items()
-        ],
-    }
-    packed = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    box = {"left": LEFT, "right": RIGHT, "width": WIDTH}
+    axis = json.dumps({"label": part.x_label, "ends": [start, end], "box": box})
+    values = ",".join(_line_json(name, runs) for name, runs in lines.items())
+    packed = f'{axis[:-1]},"lines":[{values}]}}'.replace("<", "\\u003c")
     return (
         f"<figure data-curve><figcaption>{escape(part.title)}</figcaption>"
         f"{_legend(colours, dashes)}{_svg(drawn, part.title, part.x_label, part.y_label)}"
@@ -129,8 +123,10 @@ def _ends(places: np.ndarray) -> tuple[float, float]:
     return first, last if last > first else first + 1
 
 
-def _short(value: float) -> float:
-    return float(f"{value:.5g}")
+def _line_json(name: str, runs: list[list[Place]]) -> str:
+    """Text at once: nested lists of a long curve would be the largest thing of a report."""
+    points = ",".join(f"[{x:.5g},{y:.5g}]" for run in runs for x, y in run)
+    return f'{{"name":{json.dumps(name)},"points":[{points}]}}'
 
 
 def histogram_html(part: Histogram) -> str:

@@ -25,7 +25,7 @@ from dyfn_core.scoring.protocols import align_depth
 
 CAPTION, BAR, GAP = 22, 44, 2  # pixels of the picture
 PAPER = 255
-STOPS = 24  # of a colour bar's gradient
+STOPS = 64  # of a colour bar's gradient
 ERROR_UNIT = "error |d - p| / d, share of the true depth d"
 
 
@@ -34,7 +34,7 @@ class ShownFrames:
     """The kept frames of a variant, and what aligns its predictions to the truth.
 
     scale, shift: one alignment for all frames (the video protocol's), so that drift shows; 1 and
-    0 where the prediction is in metres or nothing is known. quantity: depth or disparity.
+    0 without truth. quantity: depth or disparity.
     """
 
     snapshots: Sequence[DepthSnapshot]
@@ -178,7 +178,7 @@ def grid_picture(grid: FrameGrid) -> np.ndarray:
         _write(cells[0], label, corner, thickness=3)
         _write(cells[0], label, corner, (255, 255, 255))
         rows.append(np.hstack(cells))
-    return np.vstack([*rows, _bars(grid.bars, width * len(grid.columns))])
+    return np.vstack([*rows, draw_bars(grid.bars, width * len(grid.columns))])
 
 
 def _captions(names: Sequence[str], width: int) -> np.ndarray:
@@ -190,16 +190,19 @@ def _captions(names: Sequence[str], width: int) -> np.ndarray:
     return bar
 
 
-def _bars(bars: Sequence[ColourBar], width: int) -> np.ndarray:
+def draw_bars(bars: Sequence[ColourBar], width: int) -> np.ndarray:
+    """Colour bars side by side with their labels and ticks, BAR x width x 3 uint8 RGB."""
     drawn = np.full((BAR, width, 3), PAPER, np.uint8)
     room = width // len(bars)
     for number, bar in enumerate(bars):
-        left, length = number * room + 4, max(room - 60, 20)
+        left, length = number * room + 4, max(room - 50, 20)
         places = np.linspace(0, len(bar.colours) - 1, length).round().astype(int)
         drawn[18:28, left : left + length] = bar.colours[places]
         _write(drawn, bar.label, (left, 12))
         for share, text in bar.ticks.items():
-            _write(drawn, text, (left + int(share * (length - 1)), 41))
+            _write(
+                drawn, text, (left + int(share * (length - 1)) - round(3.5 * len(text) * share), 41)
+            )
     return drawn
 
 

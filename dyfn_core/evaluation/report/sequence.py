@@ -35,8 +35,7 @@ WORST_NOTE = (
 
 
 FRAMES_NOTE = (
-    "One alignment (scale and shift) to the truth for all frames of a run, so that drift shows; "
-    "what is in metres is shown as it is."
+    "One alignment (scale and shift) to the truth for all frames of a run, so that drift shows."
 )
 UNALIGNED_NOTE = "Without ground truth a depth has no unit: red is near, blue is far."
 COLUMNS = ("scale", "shift", "video_abs_rel", "image_abs_rel", "metric_abs_rel")

@@ -227,7 +227,7 @@ def test_a_cloud_is_bounded_and_where_it_was() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-2, 2, (100_000, 3))
     points[0] = 1e6
-    cloud = PointCloud(points, rng.integers(0, 255, points.shape, np.uint8))
+    cloud = PointCloud(points, np.full(points.shape, 90, np.uint8))
     page = cloud_html(CloudView({"a": cloud, "b": cloud}, unit=""))
     found = re.search(r'<script type="application/json">(.*?)</script>', page)
     assert found is not None and len(page) < 700_000

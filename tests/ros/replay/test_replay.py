@@ -86,7 +86,7 @@ def test_it_writes_everything(recording: Path, tmp_path: Path) -> None:
     assert strip.shape[1] > 4 * 200 and strip.std() > 20
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count('class="frames"') == 2  # strip, worst frames
-    assert page.count('role="img"') == 5  # curves, latency
+    assert page.count('role="img"') == 5 + 1  # curves, latency; the cloud
     assert "http" not in page
     assert "tiny with DyFN" in page
 

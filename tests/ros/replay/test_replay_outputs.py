@@ -29,7 +29,7 @@ from dyfn_ros.replay.jobs import ALL, UNUSABLE
 from dyfn_ros.replay.outputs import ReplayOutputs
 from dyfn_ros.replay.rerun import ROOM
 from dyfn_ros.replay.settings import FILES, Outputs
-from dyfn_ros.replay.video import Alignment
+from dyfn_ros.replay.shown_run import Alignment, ShownRun
 from tests.support.tiny_model import load_tiny
 from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
 
@@ -71,7 +71,8 @@ def written(tmp_path: Path) -> Callable[..., list[str]]:
             for frame in open_recording(tmp_path / "walk").frames():
                 depth = WALL - 0.3 * frame.index + np.zeros(SIZE)
                 outputs.write(frame, perfect_up_to(2.5, depth), FrameScore(1.0, 10))
-            outputs.finish(Alignment(2.5, 0.0) if aligned else None)
+            alignment = Alignment(2.5, 0.0, metres=True) if aligned else Alignment()
+            outputs.finish([ShownRun("with DyFN", alignment, np.ones(len(frames)))])
         return warnings
 
     return write
@@ -140,13 +141,17 @@ def test_the_video_plays_at_the_pace_of_the_stamps(
         assert video.streams.video[0].codec_context.name == "h264"
         shown = list(video.decode(video=0))
     assert [f.time for f in shown] == pytest.approx([0, 0.1, 0.2, 0.3, 1.3], abs=2e-3)
-    pictures = [f.to_ndarray(format="rgb24")[24:60] for f in shown]
-    middles = [p[5:-5, 48 + 5 : 96 - 5].mean((0, 1)) for p in pictures]
-    green = [p[5:-5, 5:43].mean((0, 1)) for p in pictures]
+    pictures = [f.to_ndarray(format="rgb24") for f in shown]
+    assert pictures[0].shape == (2 * (24 + 36) + 44, 3 * 48, 3)  # captions, panels, colour bars
+    truths, middles = (
+        [p[29:55, left + 5 : left + 43].mean((0, 1)) for p in pictures] for left in (48, 96)
+    )
+    np.testing.assert_allclose(truths, middles, atol=3)
+    green = [p[29:55, 5:43].mean((0, 1)) for p in pictures]
     np.testing.assert_allclose(green, np.tile([10, 200, 30], (5, 1)), atol=8)
     assert np.abs(np.diff(middles, axis=0)).max(1).min() > 5  # nearer is redder, frame by frame
     assert middles[-1][0] > middles[0][0] and middles[-1][2] < middles[0][2]
-    assert all(p[5:-5, 96 + 5 : 144 - 5].mean() < 12 for p in pictures)  # no error: black
+    assert all(p[89:115, 101:139].mean() < 12 for p in pictures)  # no error: black
 
 
 def test_flicker_is_seen_in_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,10 +165,48 @@ def test_flicker_is_seen_in_the_video(tmp_path: Path, monkeypatch: pytest.Monkey
     ramp = np.tile(np.linspace(1, 5, SIZE[1]), (SIZE[0], 1))
     for scale in (1.0, 1.3, 1.0):
         spool.push(frame, perfect_up_to(1 / scale, ramp), None)
-    colours = replay_video._Colours(spool, Alignment())
-    first, second, third = (colours.draw(small)[24:, 48:] for small in spool)
+    run = ShownRun("base model", Alignment(), np.full(3, np.nan))
+    panels = replay_video._Panels(spool, [run])
+    first, second, third = (panels.draw(i, small)[24:60, 48:] for i, small in enumerate(spool))
     np.testing.assert_array_equal(first, third)
     assert np.abs(first.astype(int) - second).mean() > 10
+
+
+def test_base_and_result_share_the_colours_of_the_video_and_the_report(tmp_path: Path) -> None:
+    """Two runs in units of their own look like the truth; one that drifts does not."""
+    from dyfn_ros.replay import cloud, frame_spool
+    from dyfn_ros.replay import video as replay_video
+
+    spool = frame_spool.FrameSpool(tmp_path)
+    record(tmp_path / "walk", facing_a_wall(3))
+    for frame in open_recording(tmp_path / "walk").frames():
+        assert frame.depth is not None
+        spool.push(frame, perfect_up_to(2.5, frame.depth), camera_pose(frame.index))
+    for frame in open_recording(tmp_path / "walk").frames():
+        assert frame.depth is not None
+        spool.push_base(perfect_up_to(7.0 + frame.index, frame.depth))
+    runs = [
+        ShownRun("with DyFN", Alignment(2.5, metres=True), np.ones(3)),
+        ShownRun("base model", Alignment(7.0, metres=True), np.array([1.0, 8 / 7, 9 / 7])),
+    ]
+    panels = replay_video._Panels(spool, runs)
+    drawn = [panels.draw(i, small).astype(int) for i, small in enumerate(spool)]
+    assert drawn[0].shape == (2 * (24 + 36) + 44, 4 * 48, 3)
+    truth, base, result = (
+        np.array([p[24:60, left : left + 48] for p in drawn]) for left in (48, 96, 144)
+    )
+    np.testing.assert_array_equal(truth, result)
+    np.testing.assert_array_equal(truth[0], base[0])
+    assert np.abs(truth[2] - base[2]).mean() > 5  # the base has drifted
+    error = [np.abs(p[84:120, left : left + 48]).mean() for p in drawn[2:] for left in (96, 144)]
+    assert error[0] > 5 * error[1]
+    curve = [(p[60:120, :96] != drawn[0][60:120, :96]).sum() for p in drawn]
+    assert 0 == curve[0] < curve[1] < curve[2]  # it runs on
+    view = cloud.cloud_view(spool, None, runs, 0.05, np.inf)
+    assert view is not None and [*view.clouds] == ["with DyFN", "base model", "ground truth"]
+    middle = {name: np.median(one.points[:, 2]) for name, one in view.clouds.items()}
+    assert middle["with DyFN"] == pytest.approx(middle["ground truth"])
+    assert middle["base model"] == pytest.approx(middle["ground truth"] * 7 / 8)
 
 
 def test_the_rerun_recording_can_be_read_back(
