@@ -46,7 +46,7 @@ class MotionOptions:
 
     tracks: TrackOptions = field(default_factory=TrackOptions)
     views: int = 10
-    parallax: float = 2.0
+    parallax: float = 3.0
     pixel_noise: float = 0.5
     most_rms: float = 2.0
     trusted_rms: float = 1.0

@@ -31,7 +31,7 @@ from dyfn_core.metric.scale_filter import (
     update,
 )
 
-_DOUBT = 2.5  # factor on a point's sigma: points of one frame err alike
+_DOUBT = 1.5  # factor on a point's sigma: points of one frame err alike
 _SHAPE = 0.11  # standard deviation of log depth that the field leaves to the prediction
 
 
@@ -284,6 +284,6 @@ def _field(
     doubted = state.contradicted > options.shape_doubt
     if options.field is None or doubted or good.sum() < options.motion.fewest:
         return np.zeros(frame.depth.shape, np.float32)
-    noise = np.hypot(_DOUBT * points.sigma[good], _SHAPE)
-    depth = np.where(frame.valid, frame.depth, np.nan)
-    return scale_field(points.pixels[good], residuals[good], noise, depth, options.field)
+    sigma, depth = points.sigma[good], np.where(frame.valid, frame.depth, np.nan)
+    noise, misfit = np.hypot(_DOUBT * sigma, _SHAPE), np.hypot(sigma, _SHAPE)
+    return scale_field(points.pixels[good], residuals[good], noise, depth, options.field, misfit)

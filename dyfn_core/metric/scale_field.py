@@ -9,7 +9,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 _DEPTH = 0.2  # weight of log depth beside the place in the picture
-_FAR = 3.0  # standard deviations beyond which a point loses weight
+_OUTLIER = 2.0  # expected misfits at which a point has lost half of its weight
+_ROUNDS = 3  # of weighing the points by their misfits
 
 
 @dataclass(frozen=True)
@@ -23,8 +24,8 @@ class FieldOptions:
         step: pixels between the places where it is evaluated; it is interpolated in between.
     """
 
-    length: float = 0.3
-    deviation: float = 0.18
+    length: float = 0.2
+    deviation: float = 0.2
     most: int = 400
     step: int = 8
 
@@ -35,15 +36,19 @@ def scale_field(
     noise: np.ndarray,
     depth: np.ndarray,
     options: FieldOptions,
+    misfit: np.ndarray | None = None,
 ) -> np.ndarray:
     """The field that explains the points' residual log ratios.
+
+    Points on things that move, or that something hides by now, lose weight.
 
     Args:
         pixels: N x 2, (x, y).
         residuals: N, log(measured / predicted) less the frame's log scale.
-        noise: N, standard deviations of the residuals.
+        noise: N, standard deviations of the residuals, as far as they may err alike.
         depth: H x W predicted depth; not finite or <= 0 where there is no prediction.
         options: see FieldOptions.
+        misfit: N, standard deviations of what the field leaves of a residual; None: `noise`.
 
     Returns:
         H x W float32, to be added to log depth; 0 without points.
@@ -51,16 +56,17 @@ def scale_field(
     height, width = depth.shape
     if not len(residuals):
         return np.zeros((height, width), np.float32)
+    misfit = noise if misfit is None else misfit
     if len(residuals) > options.most:
         best = np.sort(np.argsort(noise, kind="stable")[: options.most])
-        pixels, residuals, noise = pixels[best], residuals[best], noise[best]
+        pixels, residuals, noise, misfit = (a[best] for a in (pixels, residuals, noise, misfit))
     rows = np.clip(np.rint(pixels[:, 1]).astype(int), 0, height - 1)
     columns = np.clip(np.rint(pixels[:, 0]).astype(int), 0, width - 1)
     logs = _log(depth[rows, columns])
     middle = float(np.median(logs[np.isfinite(logs)])) if np.isfinite(logs).any() else 0.0
     longest = max(height, width)
     inside = _features(pixels / longest, logs, middle, options)
-    weights = _conditioned(inside, residuals, noise, options)
+    weights = _conditioned(_kernel(inside, inside, options), residuals, noise, misfit)
     step = min(options.step, height, width)
     y, x = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -108,14 +114,13 @@ def _kernel(first: np.ndarray, second: np.ndarray, options: FieldOptions) -> np.
 
 
 def _conditioned(
-    inside: np.ndarray, residuals: np.ndarray, noise: np.ndarray, options: FieldOptions
+    kernel: np.ndarray, residuals: np.ndarray, noise: np.ndarray, misfit: np.ndarray
 ) -> np.ndarray:
-    """The weights of the points (N); outliers are held back by one reweighting."""
-    kernel = _kernel(inside, inside, options)
+    """The weights of the points (N), by iteratively reweighted least squares (Cauchy's)."""
     variance = noise**2
-    for _ in range(2):
+    for _ in range(_ROUNDS):
         factor = cho_factor(kernel + np.diag(variance), lower=True, check_finite=False)
         weights: np.ndarray = cho_solve(factor, residuals, check_finite=False)
-        misfit = np.abs(residuals - kernel @ weights)
-        variance = noise**2 * np.maximum(1.0, misfit / (_FAR * noise)) ** 2
+        left = (residuals - kernel @ weights) / (_OUTLIER * misfit)
+        variance = noise**2 * (1 + left**2)
     return weights

@@ -24,8 +24,8 @@ class FilterOptions:
     """
 
     drift: float = 0.009
-    deviation: float = 0.25
-    seconds: float = 1.0
+    deviation: float = 0.35
+    seconds: float = 0.5
     another_stream: float = 0.2
 
 

@@ -88,7 +88,7 @@ def test_metres_wait_until_the_odometry_has_agreed(walked: list[MotionFrame]) ->
     state, found = run(quick)
     assert state.unit is not None  # relative depth does not wait
     assert found[-1].metric is None
-    assert "of the last frames, 70% needed: no metres" in found[-1].problem
+    assert "of the last frames, 75% needed: no metres" in found[-1].problem
 
 
 def test_unit_is_locked_and_the_output_never_jumps(walked: list[MotionFrame]) -> None:

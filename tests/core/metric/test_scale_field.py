@@ -92,3 +92,16 @@ def test_small_pictures_and_many_points() -> None:
     values = np.where(noise > 1, 9.0, 0.1)  # only the most certain 400 count
     found = scale_field(where, values, noise, np.full(SIZE, 2.0), OPTIONS)
     assert np.abs(found - 0.1).max() < 0.05
+
+
+def test_points_of_what_moves_are_held_back_where_noise_is_shared() -> None:
+    """A third of the points in one corner are wrong; the rest say 0.1."""
+    where, draw = points(300), np.random.default_rng(2)
+    corner = (where[:, 0] < 80) & (where[:, 1] < 60)
+    wrong = corner & (draw.random(300) < 0.33)
+    values = np.where(wrong, -0.9, 0.1)
+    sigma = np.full(300, 0.1)
+    shape = np.full(SIZE, 2.0)
+    robust = scale_field(where, values, 1.5 * sigma, shape, OPTIONS, sigma)
+    assert wrong.sum() > 15
+    assert np.median(robust[:60, :80]) == pytest.approx(0.1, abs=0.08)
