@@ -8,6 +8,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dyfn_core.data.rgbd.cameras import (
+    PUBLISHED_SIZE,
+    SEVEN_SCENES_CAMERA,
+    SEVEN_SCENES_DEPTH,
+    FolderCamera,
+    laid_over,
+)
+
 PATCH = (slice(2, 6), slice(3, 9))  # pixels without truth
 
 
@@ -144,6 +152,16 @@ def make_seven_scenes(folder: Path, frames: int) -> None:
         write_image(folder / f"frame-{i:06}.color.png", image(i, (24, 32)))
         write_depth(folder / f"frame-{i:06}.depth.png", depth(i, (24, 32)), 1000, invalid=65535)
         write_matrix(folder / f"frame-{i:06}.pose.txt", pose(i))
+
+
+def over_colour(depth: np.ndarray) -> np.ndarray:
+    """7-Scenes' depth where the colour image has it."""
+    size = (depth.shape[0], depth.shape[1])
+    cameras = [
+        FolderCamera(camera, "7-Scenes", PUBLISHED_SIZE).at(size)
+        for camera in (SEVEN_SCENES_DEPTH, SEVEN_SCENES_CAMERA)
+    ]
+    return laid_over(depth, *cameras)
 
 
 def make_video(folder: Path, name: str, frames: int, size: tuple[int, int] = (48, 64)) -> None:

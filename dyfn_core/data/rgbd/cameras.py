@@ -23,7 +23,9 @@ TUM_CAMERAS: dict[str, Camera] = {
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
     "bonn": (542.822841, 542.576870, 315.593520, 237.756098),
 }
-SEVEN_SCENES_CAMERA: Camera = (585.0, 585.0, 320.0, 240.0)
+# 7-Scenes publishes 585, which is the depth camera's; its depth is not laid over the colour image.
+SEVEN_SCENES_CAMERA: Camera = (525.0, 525.0, 320.0, 240.0)
+SEVEN_SCENES_DEPTH: Camera = (585.0, 585.0, 320.0, 240.0)
 PUBLISHED_SIZE: Size = (480, 640)
 
 
@@ -77,6 +79,27 @@ def published_camera(folder: Path) -> FolderCamera | None:
         return None
     source = f"published intrinsics of {known[-1]}"
     return FolderCamera(TUM_CAMERAS[known[-1]], source, PUBLISHED_SIZE)
+
+
+def laid_over(depth: np.ndarray, depth_camera: Camera, camera: Camera) -> np.ndarray:
+    """Depth of one camera as another one at the same place sees it, by the nearest pixel.
+
+    Args:
+        depth: H x W.
+        depth_camera: intrinsics of it.
+        camera: of the result, in pixels of the same size.
+
+    Returns:
+        H x W; NaN outside the view of depth.
+    """
+    height, width = depth.shape
+    (fx, fy, cx, cy), (gx, gy, dx, dy) = depth_camera, camera
+    columns = np.rint(cx + (np.arange(width) - dx) * fx / gx).astype(int)
+    rows = np.rint(cy + (np.arange(height) - dy) * fy / gy).astype(int)
+    inside = (rows >= 0) & (rows < height)
+    inside = inside[:, None] & ((columns >= 0) & (columns < width))[None]
+    found = depth[np.clip(rows, 0, height - 1)[:, None], np.clip(columns, 0, width - 1)[None]]
+    return np.asarray(np.where(inside, found, np.float32(np.nan)))
 
 
 def read_camera(path: Path) -> FolderCamera:

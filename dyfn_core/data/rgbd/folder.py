@@ -11,7 +11,7 @@ import numpy as np
 
 from dyfn_core.data.files import read_colour, read_uint16, registered, rgbd_frame
 from dyfn_core.data.frames import DataError, FrameError, RgbdFrame, camera_intrinsics
-from dyfn_core.data.rgbd.cameras import Camera, FolderCamera, Size, read_camera
+from dyfn_core.data.rgbd.cameras import Camera, FolderCamera, Size, laid_over, read_camera
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,8 @@ class RgbdFolder:
         calibration: where the intrinsics are; they are read when they are asked for.
         unit: stored depth values per metre.
         invalid: stored values that mean no depth, besides 0.
+        depth_camera: intrinsics of the depth files, which are then laid over the images. With
+            intrinsics that were given, or are in the folder, depth is taken to lie there already.
     """
 
     path: Path
@@ -67,6 +69,7 @@ class RgbdFolder:
     calibration: Calibration
     unit: float
     invalid: tuple[int, ...] = ()
+    depth_camera: FolderCamera | None = None
 
     @property
     def with_depth(self) -> list[FrameFiles]:
@@ -121,13 +124,21 @@ class RgbdFolder:
         return read_colour(frame.image)
 
     def depth(self, frame: FrameFiles) -> np.ndarray | None:
-        """h x w float32 metres, NaN invalid; None without a file. Raises FrameError."""
+        """h x w float32 metres over the image, NaN invalid; None without a file.
+
+        Raises:
+            FrameError: it cannot be read, or the intrinsics are of other images.
+        """
         if frame.depth is None:
             return None
         stored = read_uint16(frame.depth)
         metres: np.ndarray = stored.astype(np.float32) / np.float32(self.unit)
         metres[np.isin(stored, (0, *self.invalid))] = np.nan
-        return metres
+        published = self.calibration.published
+        if self.depth_camera is None or published is None or self.camera is not published:
+            return metres
+        size = _size(metres)
+        return laid_over(metres, self.depth_camera.at(size), published.at(size))
 
     def registered(self, frame: FrameFiles) -> tuple[np.ndarray, np.ndarray]:
         """Image and depth at the smaller one's size. Raises FrameError, also without depth."""

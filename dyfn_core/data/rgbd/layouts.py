@@ -14,6 +14,7 @@ from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import (
     PUBLISHED_SIZE,
     SEVEN_SCENES_CAMERA,
+    SEVEN_SCENES_DEPTH,
     Camera,
     FolderCamera,
     published_camera,
@@ -152,7 +153,8 @@ def _seven_scenes(folder: Path, report: DataReport, options: FolderOptions) -> R
     published = FolderCamera(SEVEN_SCENES_CAMERA, source, PUBLISHED_SIZE)
     calibration = options.calibration(folder / "K.txt", published)
     unit = options.depth_scale or MILLIMETRES
-    return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,))
+    depth_camera = FolderCamera(SEVEN_SCENES_DEPTH, source, PUBLISHED_SIZE)
+    return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,), depth_camera)
 
 
 def _tum(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:

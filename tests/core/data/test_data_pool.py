@@ -143,7 +143,7 @@ def test_a_pose_of_a_plain_folder_that_is_none_is_counted(tmp_path: Path) -> Non
 def test_seven_scenes_takes_its_published_camera(tmp_path: Path) -> None:
     make_seven_scenes(tmp_path)
     (sequence,), _ = open_kind("rgbd_folder", tmp_path, {})
-    np.testing.assert_allclose(sequence.read(0).intrinsics[:2], [585 / 640, 585 / 480], rtol=1e-6)
+    np.testing.assert_allclose(sequence.read(0).intrinsics[:2], [525 / 640, 525 / 480], rtol=1e-6)
 
 
 def test_folder_without_intrinsics_says_how_to_give_them(tmp_path: Path) -> None:

@@ -276,3 +276,37 @@ def test_a_camera_file_goes_before_the_published_one(tmp_path: Path) -> None:
     frame = found.read(found.frames[0])
     assert depth_frame_of(frame.depth) == 0 and frame.stamp == 0.5
     assert re.search("freiburg1", found.camera.source if found.camera else "")
+
+
+def write_seven_scenes(folder: Path) -> np.ndarray:
+    """One frame of 640 x 480; depth rises by 1 mm a column, from 1 m. -> the stored depth."""
+    folder.mkdir(exist_ok=True)
+    stored = np.tile(1000 + np.arange(640, dtype=np.uint16), (480, 1))
+    write(folder / "frame-000000.color.png", np.zeros((480, 640, 3), np.uint8))
+    write(folder / "frame-000000.depth.png", stored)
+    np.savetxt(folder / "frame-000000.pose.txt", np.eye(4))
+    return stored
+
+
+def test_seven_scenes_depth_is_laid_over_the_colour_image(tmp_path: Path) -> None:
+    """A ray's column is 320 + 525 x / z in colour and 320 + 585 x / z in depth."""
+    write_seven_scenes(tmp_path)
+    folder, _ = opened(tmp_path)
+    assert folder.camera is not None and folder.camera.pixels == (525, 525, 320, 240)
+    depth = folder.depth(folder.frames[0])
+    assert depth is not None
+    for column in (40, 320, 600):
+        there = round(320 + (column - 320) * 585 / 525)
+        assert depth[240, column] == pytest.approx(1 + there / 1000, abs=1e-6)
+    assert np.isnan(depth[:, :32]).all() and np.isnan(depth[:24]).all()
+    assert np.isfinite(depth[30:-30, 35:-35]).all()
+
+
+def test_depth_of_a_folder_with_its_own_camera_stays_where_it_is(tmp_path: Path) -> None:
+    stored = write_seven_scenes(tmp_path)
+    np.savetxt(tmp_path / "K.txt", [[500, 0, 320], [0, 500, 240], [0, 0, 1]])
+    folder, _ = opened(tmp_path)
+    depth = folder.depth(folder.frames[0])
+    np.testing.assert_allclose(depth, stored / 1000, atol=1e-6)
+    given, _ = opened(tmp_path, FolderOptions(intrinsics=(510, 510, 320, 240)))
+    np.testing.assert_allclose(given.depth(given.frames[0]), stored / 1000, atol=1e-6)

@@ -26,7 +26,7 @@ SEQUENCES = tuple(
 
 
 def open_seven_scenes(root: Path, report: DataReport) -> list[BenchmarkSource]:
-    """uint16 millimetres, 0 and 65535 invalid; 585, 585, 320, 240 as intrinsics."""
+    """uint16 millimetres, 0 and 65535 invalid; colour of focal length 525, depth of 585."""
     return rgbd_sources(
         root,
         (SEVEN_SCENES,),
