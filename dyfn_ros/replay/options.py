@@ -103,7 +103,7 @@ def _check(reader: argparse.ArgumentParser, given: dict[str, Any], run: Run) -> 
     if given["prediction_topic"] is None:
         if given["quantity"] is not None:
             reader.error("--quantity describes --prediction-topic, which is not given")
-        if run.compare and not run.stream.stabilize:
+        if run.compare and not run.stream.stabilize and run.without_odometry() is None:
             reader.error("--compare has no effect with --no-stabilize: both runs are the same")
         return
     for name in ("compare", "controls"):
@@ -249,7 +249,11 @@ def _add_run(group: Options) -> None:
     add_model(group)
     add_device(group)
     add_threads(group)
-    add("--compare", action="store_true", help="also run the base model, for one report on both")
+    add(
+        "--compare",
+        action="store_true",
+        help="also run the base model, and DyFN without odometry, for one report on all",
+    )
     add_controls(group, default=False)
     add(
         "--prediction-topic",

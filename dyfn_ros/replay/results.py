@@ -33,7 +33,8 @@ class Result:
         name: Of the model, or the topic of the predictions.
         stabilized: Whether DyFN took part.
         evaluation: Of every frame.
-        base: Of the same frames without DyFN; None: not run.
+        base: Of the same frames without DyFN and odometry; None: not run.
+        alone: Of the same frames with DyFN, without the odometry; None: not run, or there is none.
         options: What the run adds to the `options` of metrics.json.
         cloud: Clouds for the report; None: no cloud.
         stream: What metrics.json has of the stream session.
@@ -43,6 +44,7 @@ class Result:
     stabilized: bool
     evaluation: SequenceEvaluation
     base: SequenceEvaluation | None
+    alone: SequenceEvaluation | None
     options: dict[str, Any]
     cloud: CloudView | None
     stream: dict[str, Any] = field(default_factory=dict)
@@ -87,6 +89,7 @@ def _metrics(
         "quantity": result.evaluation.quantity,
         **results,
         **({} if result.base is None else {"base": result.base.results()}),
+        **({} if result.alone is None else {"without_odometry": result.alone.results()}),
         **result.stream,
         "recording": {
             "path": str(source.recording),
@@ -131,8 +134,10 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     notes = recording["losses"] | recording["warnings"]
     name = run_name(metrics)
     runs, base = {name: result.evaluation}, None
+    if result.alone is not None:
+        runs[run_name(metrics, odometry=False)] = result.alone
     if result.base is not None:
-        base = run_name({**metrics, "stabilizer": False})
+        base = run_name({**metrics, "stabilizer": False}, odometry=False)
         runs[base] = result.base
     controlled = result.evaluation.controls.keys() > CONTROLS.keys()
     note = CONTROLS_NOTE if controlled else ""
@@ -144,16 +149,22 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     write_report(path, f"Replay of {Path(recording['path']).name}", sections)
 
 
-def run_name(metrics: dict[str, Any]) -> str:
-    """How a run is called in tables."""
+def run_name(metrics: dict[str, Any], odometry: bool = True) -> str:
+    """How a run is called in tables. odometry: whether it took part, if the run had any."""
     if metrics["model"].startswith("/"):  # a topic: who made it is not known
         return str(metrics["model"])
-    return f"{metrics['model']}{' with DyFN' if metrics['stabilizer'] else ', base model'}"
+    moved = odometry and metrics["options"].get("metric_source") == "odometry"
+    if not metrics["stabilizer"]:
+        return f"{metrics['model']}, base model{' with odometry' if moved else ''}"
+    return f"{metrics['model']} with DyFN{' and odometry' if moved else ''}"
 
 
 def results_by_name(metrics: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """What was run -> its results."""
     found = {run_name(metrics): metrics}
+    if "without_odometry" in metrics:
+        found[run_name(metrics, odometry=False)] = metrics["without_odometry"]
     if "base" in metrics:
-        found[run_name({**metrics, "stabilizer": False})] = metrics["base"]
+        name = run_name({**metrics, "stabilizer": False}, odometry=False)
+        found[name] = metrics["base"]
     return found

@@ -66,18 +66,23 @@ def replay(
     with computing_threads(run.threads) as threads:
         runner = _runner(reader, run, model)
         files = ReplayOutputs(outputs, source.recording, reader.warn)
-        base = None
+        base, alone = None, None
+        plain = run.without_odometry()
+        compared = run.compare and (stabilized or plain is not None)
         with files:
             evaluation = _evaluate(reader, runner, model, outputs, files.write)
             reader.require(evaluation.frames)
             name = "with DyFN" if stabilized else "base model"
+            name += "" if plain is None else " and odometry"
             runs = [_shown(name, evaluation, runner.metres_per_unit)]
-            if run.compare and stabilized:
+            if compared:
                 base = _variant(source, run.without_dyfn(), model, outputs, files)
                 runs.append(_shown("base model", base, None))
             files.finish(runs)
         runner.finish()
-        if run.compare and not stabilized:
+        if compared and stabilized and plain is not None:
+            alone = _variant(source, plain, model, outputs)
+        if run.compare and not compared:
             reader.warn(f"--compare: {run.model} ran without DyFN, there is nothing to compare")
         if run.controls:
             evaluation.controls |= _controls(source, run, model, outputs)
@@ -85,7 +90,7 @@ def replay(
         reader.warn("--load-state: base model and controls started without the saved state")
     options = {**stream_facts(run), "threads": threads}
     facts = runner.facts()
-    result = Result(run.model, stabilized, evaluation, base, options, files.cloud, facts)
+    result = Result(run.model, stabilized, evaluation, base, alone, options, files.cloud, facts)
     return write_results(source, reader.recording, outputs, result)
 
 

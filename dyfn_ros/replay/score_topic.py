@@ -52,7 +52,7 @@ def score_topic(source: Source, topic: PredictionTopic, outputs: Outputs) -> dic
         "threads": 0,
         "predicted": topic.quantity,
     }
-    result = Result(topic.topic, False, evaluation, None, options, None)
+    result = Result(topic.topic, False, evaluation, None, None, options, None)
     return write_results(source, reader.recording, outputs, result)
 
 

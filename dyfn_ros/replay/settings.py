@@ -104,8 +104,11 @@ class Run:
         return self._variant(self.stream.stabilize)._without_odometry()
 
     def with_dyfn(self) -> Run:
-        """The same run with DyFN, or what stands in its place, and without a saved state."""
-        return self._variant(stabilize=True)
+        """The same run with DyFN, or what stands in its place, and without a saved state.
+
+        Without odometry, which would steady what stands there.
+        """
+        return self._variant(stabilize=True)._without_odometry()
 
     def _without_odometry(self) -> Run:
         if self.stream.metric_source != "odometry":

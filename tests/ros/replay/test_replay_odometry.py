@@ -15,6 +15,7 @@ from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL, UNUSABLE
+from dyfn_ros.replay.run import ModelLoader
 from tests.support.odometry import MOUNT, SECOND, odometry, pose_text
 from tests.support.pinhole import FOV_X, PinholeModel
 from tests.support.textured_plane import CAMERA, SIZE, plane_view, texture, walk
@@ -44,9 +45,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def run(folder: Path, out: Path, *options: str) -> dict[str, Any]:
+def plain_model(name: str, device: str) -> PinholeModel:
+    return PinholeModel()
+
+
+def stabilized(name: str, device: str) -> PinholeModel:
+    return PinholeModel(stabilized=True)
+
+
+def run(folder: Path, out: Path, *options: str, model: ModelLoader = plain_model) -> dict[str, Any]:
     fixed = ["--out", str(out), "--threads", "1", "--scene-cut-threshold", "0", "--write", "ply"]
-    code = main([str(folder), *fixed, *options], lambda name, device: PinholeModel())
+    code = main([str(folder), *fixed, *options], model)
     assert code == ALL
     return json.loads((out / "metrics.json").read_text())
 
@@ -142,9 +151,22 @@ def test_metres_of_a_run_without_truth_are_the_cloud_s(folder: Path, tmp_path: P
     assert (tmp_path / "cloud.ply").exists()
 
 
-def test_base_is_compared_without_odometry(folder: Path, tmp_path: Path) -> None:
+def test_odometry_is_compared_with_none(folder: Path, tmp_path: Path) -> None:
     found = run(folder, tmp_path, "--metric-source", "odometry", "--compare")
-    assert "metric" not in found.get("base", {})
+    assert found["metric"] and "metric" not in found["base"]
+    assert "base model with odometry" in (tmp_path / "report.html").read_text()
+
+
+def test_odometry_is_compared_with_dyfn_alone_and_the_base(folder: Path, tmp_path: Path) -> None:
+    plain = run(folder, tmp_path / "a", "--compare", model=stabilized)
+    found = run(
+        folder, tmp_path / "b", "--metric-source", "odometry", "--compare", model=stabilized
+    )
+    assert found["without_odometry"]["output_sha256"] == plain["output_sha256"]
+    assert found["base"]["output_sha256"] == plain["base"]["output_sha256"]
+    report = (tmp_path / "b" / "report.html").read_text()
+    for name in ("with DyFN and odometry", "with DyFN", "base model"):
+        assert f"dyfn-mini {name}" in report or f"dyfn-mini, {name}" in report
 
 
 def test_folder_without_poses_is_named(
