@@ -175,6 +175,15 @@ def add_stride(options: Options, default: int | None = 1) -> argparse.Action:
     )
 
 
+def add_strict(options: Options) -> None:
+    """--strict."""
+    options.add_argument(
+        "--strict",
+        action="store_true",
+        help="end with code 3 when the scores are implausible (the warnings say why)",
+    )
+
+
 def add_max_frames(options: Options) -> argparse.Action:
     """--max-frames."""
     return options.add_argument(

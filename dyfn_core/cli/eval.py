@@ -12,7 +12,7 @@ from typing import Any
 
 from dyfn_core.argument_types import at_least_one
 from dyfn_core.cli import reconstruct, study
-from dyfn_core.cli.arguments import Commands, command_parser, described
+from dyfn_core.cli.arguments import Commands, add_strict, command_parser, described
 from dyfn_core.cli.eval_arguments import add_benchmark, add_predictions, add_run
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.long_sequence import (
@@ -155,7 +155,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     table = write_results(results, options.out, _title(opened), options.ablations)
     path = options.out / "report.html"
     write_benchmark_report(path, _title(opened), table, results, pictures, method.seconds)
-    return _finish(text_table(table), results, options.out)
+    code = _finish(text_table(table), results, options.out)
+    return PARTIAL if options.strict and results["warnings"] else code
 
 
 def _long(options: argparse.Namespace) -> int:
@@ -205,7 +206,8 @@ def parser() -> argparse.ArgumentParser:
         "dyfn-eval",
         "Score a model, or any method's files; rebuild scenes; study the latent.",
         "Exit status: 0 everything was scored; 3 part of the benchmark was missing or could not "
-        "be scored, and --allow-missing let the rest go on; 2 nothing could be scored, or bad "
+        "be scored, and --allow-missing let the rest go on, or with --strict the scores are hard "
+        "to believe; 2 nothing could be scored, or bad "
         "arguments.",
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -261,6 +263,7 @@ def _add_tables(command: argparse.ArgumentParser) -> None:
         default=True,
         help="also compute TAE and flicker (default: %(default)s)",
     )
+    add_strict(group)
     group.add_argument("--ablations", action="store_true", help="also print the paper's ablations")
     command.set_defaults(run=_evaluate)
 

@@ -128,6 +128,11 @@ class SequenceEvaluation:
         return len(self._stamps)
 
     @property
+    def scored_frames(self) -> int:
+        """How many frames have scores."""
+        return int(np.isfinite(self.scorer.frames.column("scale")).sum())
+
+    @property
     def output_hash(self) -> str:
         """SHA-256 over the depth of every frame: float32, row-major, NaN where invalid."""
         return self._hash.hexdigest()

@@ -13,6 +13,7 @@ SAMPLES = 64
 # Distances of the nearest sample after the shift that are tried first, in units of the depth
 # range: falling, so that q rises.
 _GRID = np.geomspace(1e4, 1e-4, 49)
+FOCAL_RANGE = (0.1, 10.0)  # focal lengths in units of the image's width that are believed
 
 
 def normalize_intrinsics(camera_matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -61,6 +62,24 @@ def check_camera_matrix(camera_matrix: np.ndarray) -> np.ndarray:
     if k[0, 1] != 0 or k[1, 0] != 0 or not np.array_equal(k[2], [0.0, 0.0, 1.0]):
         raise ValueError(f"camera matrix must be [fx 0 cx; 0 fy cy; 0 0 1], got {k.tolist()}")
     return k
+
+
+def doubted_intrinsics(pixels: tuple[float, float, float, float], size: tuple[int, int]) -> str:
+    """Why intrinsics cannot be of images of a size, as a sentence; "" when they can.
+
+    pixels: fx, fy, cx, cy, the first pixel's centre at 0; size: (H, W). Wrong are a principal
+    point outside the image and focal lengths outside FOCAL_RANGE, as of another resolution.
+    """
+    (height, width), (fx, fy, cx, cy) = size, pixels
+    inside = -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5
+    low, high = (width * factor for factor in FOCAL_RANGE)
+    if inside and low <= min(fx, fy) and max(fx, fy) <= high:
+        return ""
+    return (
+        f"fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot be intrinsics in pixels of images of "
+        f"{width} x {height}: expected the principal point inside and focal lengths of {low:g} "
+        f"to {high:g}"
+    )
 
 
 def focal_from_fov(fov_x: float | Tensor, aspect: float, batch: int) -> Tensor:

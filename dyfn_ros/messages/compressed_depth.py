@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.encodings import MessageError, metres_per_value
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.messages.picture_size import PNG, check_picture_size
 from dyfn_ros.messages.rvl import decode_rvl
@@ -25,11 +25,12 @@ def is_compressed_depth(message: Any) -> bool:
     return data.startswith(PNG) and data[24:26] == b"\x10\x00"
 
 
-def decode_compressed_depth(message: Any) -> np.ndarray:
+def decode_compressed_depth(message: Any, scale: float | None = None) -> np.ndarray:
     """CompressedImage with depth -> H x W float32 metres, NaN where there is none.
 
     16-bit PNG in millimetres, plain or as compressedDepth, which may be RVL as well;
-    compressedDepth of 32FC1 is inverse depth. Raises MessageError for anything else, naming the
+    compressedDepth of 32FC1 is inverse depth. scale: values per metre, instead of 1000, and 1 for
+    32FC1. Raises MessageError for anything else, naming the
     format, and for more than MAX_PIXELS.
     """
     layout, data = str(message.format), bytes(message.data)
@@ -44,11 +45,11 @@ def decode_compressed_depth(message: Any) -> np.ndarray:
         values = _rvl(layout, data)
     else:
         values = _png16(layout, data)
-    if inverse is None:
-        metres = values.astype(np.float32) * np.float32(0.001)
-    else:
+    metres = values.astype(np.float32)
+    if inverse is not None:
         with np.errstate(divide="ignore"):
-            metres = (inverse[0] / (values.astype(np.float32) - inverse[1])).astype(np.float32)
+            metres = (inverse[0] / (metres - inverse[1])).astype(np.float32)
+    metres *= np.float32(metres_per_value("16UC1" if inverse is None else "32FC1", scale))
     valid = (values > 0) & np.isfinite(metres) & (metres > 0)
     result: np.ndarray = np.where(valid, metres, np.float32(np.nan))
     return result

@@ -233,11 +233,19 @@ def decode_colour(raster: Raster) -> np.ndarray:
     return decoder(raster)
 
 
-def decode_metric_depth(raster: Raster, *, zero: bool = False) -> np.ndarray:
+def metres_per_value(encoding: str, scale: float | None = None) -> float:
+    """Of stored depth; scale: stored values per metre, None: millimetres but for 32FC1."""
+    return 1 / scale if scale else 1.0 if encoding == "32FC1" else 0.001
+
+
+def decode_metric_depth(
+    raster: Raster, *, zero: bool = False, scale: float | None = None
+) -> np.ndarray:
     """-> H x W float32 metres, NaN where there is no depth (REP-118).
 
     16UC1 and mono16 are millimetres, 0 invalid; 32FC1 is metres, where zero, negative and
     non-finite values are invalid. zero: a 0 of 32FC1 is valid, as it is of disparity (far away).
+    scale: stored values per metre, instead of 1000 and 1.
     Raises MessageError as decode_colour does.
     """
     if raster.encoding not in DEPTH_ENCODINGS:
@@ -249,7 +257,8 @@ def decode_metric_depth(raster: Raster, *, zero: bool = False) -> np.ndarray:
         depth: np.ndarray = _rows(raster, "f4", 1)[..., 0].copy()
         valid = depth >= 0 if zero else depth > 0
     else:
-        depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32) * np.float32(0.001)
+        depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32)
         valid = depth > 0
+    depth *= np.float32(metres_per_value(raster.encoding, scale))
     depth[~(np.isfinite(depth) & valid)] = np.nan
     return depth

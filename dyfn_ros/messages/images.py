@@ -45,12 +45,12 @@ def decode_image(message: Any) -> np.ndarray:
     return decode_colour(_raster(message))
 
 
-def decode_depth(message: Any, *, zero: bool = False) -> np.ndarray:
+def decode_depth(message: Any, *, zero: bool = False, scale: float | None = None) -> np.ndarray:
     """sensor_msgs/Image with depth -> H x W float32 metres, NaN invalid. Raises MessageError.
 
-    zero: see decode_metric_depth.
+    zero, scale: see decode_metric_depth.
     """
-    return decode_metric_depth(_raster(message), zero=zero)
+    return decode_metric_depth(_raster(message), zero=zero, scale=scale)
 
 
 def depth_fields(depth: np.ndarray, valid: np.ndarray, encoding: str = "32FC1") -> dict[str, Any]:

@@ -28,7 +28,8 @@ class GroundTruth:
 
     transform: pose of its sensor in the image's optical frame; None: the image's own place.
     warn: takes what had to be assumed. quantity: what its images hold, one of
-    quantities.QUANTITIES; inverse depth is inverted, disparity stays what it is.
+    quantities.QUANTITIES; inverse depth is inverted, disparity stays what it is. scale: stored
+    values per metre; None: 1000 for integers, 1 for floats and points.
 
     A depth image without CameraInfo, or with the intrinsics and lens of the image, is registered
     already: it shows the image's view, at any resolution. Any other is projected into the image.
@@ -39,8 +40,10 @@ class GroundTruth:
         transform: Transform | None,
         warn: Callable[[str], None],
         quantity: str = DEPTH,
+        scale: float | None = None,
     ) -> None:
         self._transform = transform
+        self._scale = scale
         self._warn = warn
         self._quantity = quantity
 
@@ -79,14 +82,14 @@ class GroundTruth:
 
     def _image(self, message: Any, compressed: bool) -> np.ndarray:
         if compressed:
-            return scored_values(decode_compressed_depth(message), self._quantity)
-        stored = decode_depth(message, zero=self._quantity == DISPARITY)
+            return scored_values(decode_compressed_depth(message, self._scale), self._quantity)
+        stored = decode_depth(message, zero=self._quantity == DISPARITY, scale=self._scale)
         return scored_values(stored, self._quantity)
 
     def _cloud(self, message: Any, view: PinholeImage, frame_id: str) -> np.ndarray:
         if view.matrix is None:
             raise MessageError("a point cloud needs the intrinsics of the image")
-        points = decode_points(message)
+        points = decode_points(message) / (self._scale or 1.0)
         self._check_place(message, frame_id, "at the image's optical centre, z forward")
         if self._transform is not None:
             points = self._transform(points)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from dyfn_core.data.rgbd.layouts import FolderOptions
 from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.references import parse_pose
 from dyfn_ros.recordings.errors import RecordingError
@@ -42,6 +43,7 @@ def open_recording(
     depth_transform: str | None = None,
     stamps: Literal["header", "log"] = "header",
     quantity: str = DEPTH,
+    depth_scale: float | None = None,
 ) -> Recording:
     """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, or an RGB-D folder.
 
@@ -50,7 +52,8 @@ def open_recording(
     depth_transform: 'x y z qx qy qz qw', pose of the depth camera or the point cloud's sensor in
     the image's optical frame; None: at its optical centre. tolerance: seconds between the stamps
     of an image and its ground truth. stamps: "header", or "log" for the time of recording.
-    quantity: what the depth topic's images hold, see GroundTruth.
+    quantity: what the depth topic's images hold, see GroundTruth. depth_scale: stored depth values
+    per metre; None: as the encoding or the folder's layout says.
     Raises RecordingError: not a recording, nothing readable, no image topic, or several
     candidates, which are then listed with their types; ValueError for wrong options.
     """
@@ -59,7 +62,7 @@ def open_recording(
         raise ValueError(f"stamps is {stamps!r}, expected 'header' or 'log'")
     transform = parse_pose(depth_transform, "depth_transform") if depth_transform else None
     if path.is_dir() and is_rgbd_folder(path):
-        return RgbdRecording(path)
+        return RgbdRecording(path, FolderOptions(depth_scale=depth_scale))
     storage = open_storage(path)
     topics = choose_topics(
         path, storage, image_topic, camera_info_topic, depth_topic, depth_info_topic
@@ -75,7 +78,7 @@ def open_recording(
         raise RecordingError(
             f"{path}: {topics.depth} is {POINT_CLOUD}, expected images of {quantity}"
         )
-    return BagRecording(path, storage, topics, tolerance, transform, stamps, quantity)
+    return BagRecording(path, storage, topics, tolerance, transform, stamps, quantity, depth_scale)
 
 
 def image_topics(path: str | Path) -> list[str | None]:

@@ -148,12 +148,12 @@ def _matrix(camera: FolderCamera) -> np.ndarray:
 class RgbdRecording:
     """Frames of an RGB-D folder, as if they had been recorded."""
 
-    topics = Topics("rgb/", "K.txt", "depth/")
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, options: FolderOptions | None = None) -> None:
         self.path = path
         self._warnings: Counter[str] = Counter()
-        self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]))
+        self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]), options)
+        has_depth = bool(self._folder.with_depth) or (path / "depth").is_dir()
+        self.topics = Topics("rgb/", "K.txt", "depth/" if has_depth else None)
         self.notes = Notes(warnings=self._warnings.copy())
 
     @property

@@ -36,6 +36,7 @@ class BagRecording:
         transform: Transform | None = None,
         stamps: Literal["header", "log"] = "header",
         quantity: str = DEPTH,
+        depth_scale: float | None = None,
     ) -> None:
         self.path = path
         self.topics = topics
@@ -43,7 +44,7 @@ class BagRecording:
         self._rules = RectifyRules()
         self._storage = storage
         self._tolerance_ns = round(tolerance * 1e9)
-        self._truth = GroundTruth(transform, self._assumed, quantity)
+        self._truth = GroundTruth(transform, self._assumed, quantity, depth_scale)
         self._log_time = stamps == "log"
         self._matched = 0  # images with a depth
         self._offsets: list[int] = []  # of the nearest depth beyond the tolerance, ns
@@ -61,23 +62,17 @@ class BagRecording:
         infos = _Infos(self._first(self.topics.camera_info), self._unusable)
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
         calibrator = Rectifier(self._unusable)
-        index, last = 0, -1
+        index = 0
         for match in self._matches():
             infos.recorded = match.image.info or infos.recorded
             if match.depth is not None:
                 depth_infos.recorded = match.depth.info or depth_infos.recorded
             frame = self._decode(index, match, infos, depth_infos, calibrator)
             if frame is not None:
-                self._check_stamp(frame.stamp_ns, last)
-                index, last = index + 1, frame.stamp_ns
+                index += 1
                 yield frame
         self._note_offset()
         self.notes.losses.update(self._storage.losses)
-
-    def _check_stamp(self, stamp_ns: int, last: int) -> None:
-        if stamp_ns <= last and not self._log_time:
-            warning = "stamps do not rise (--stamps log takes the time of recording)"
-            self.notes.warnings[f"{self.topics.image}: {warning}"] += 1
 
     def _matches(self) -> Iterator[Match]:
         self._matched, self._offsets = 0, []

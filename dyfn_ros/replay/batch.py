@@ -209,6 +209,9 @@ def replay_all(
             path = one.job.source.recording
             print(f"dyfn-replay: {path}: {kind}: {outcome.reason}", file=sys.stderr)
     rows = [_row(one, outcomes[one.name]) for one in jobs]
+    for row in rows:
+        for text in row.metrics.get("warnings", []):
+            print(f"dyfn-replay: {row.path}: implausible: {text}", file=sys.stderr)
     print(write_summary(job.outputs.folder, rows))
     codes = {row.code for row in rows}
     if not codes & set(USABLE):

@@ -22,7 +22,7 @@ SCORES = {
     "video_delta1": ("video", "delta1"),
 }
 STATES = {0: "ok", 3: "partial"}
-COLUMNS = ("recording", "state", "code", "frames", *SCORES, "path", "reason")
+COLUMNS = ("recording", "state", "code", "frames", *SCORES, "path", "reason", "warnings")
 CONFIDENCE, RESAMPLES, SEED = 0.95, 9999, 0
 
 
@@ -51,6 +51,7 @@ class Row:
             **{name: self.score(name) for name in SCORES},
             "path": self.path,
             "reason": self.reason,
+            "warnings": "; ".join(self.metrics.get("warnings", [])),
         }
 
 
@@ -124,7 +125,10 @@ def _markdown(rows: Sequence[Row], averages: dict[str, Mean | None]) -> str:
     )
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     failed = [f"- {row.name}: {row.reason}" for row in rows if row.reason]
-    return "\n".join([table, *(["", "Not whole:", "", *failed] if failed else [])])
+    doubted = [f"- {row.name}: {text}" for row in rows for text in row.metrics.get("warnings", [])]
+    lists = {"Not whole:": failed, "Implausible:": doubted}
+    told = [line for title, found in lists.items() if found for line in ("", title, "", *found)]
+    return "\n".join([table, *told])
 
 
 def _interval(mean: Mean | None) -> str:

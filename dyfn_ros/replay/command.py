@@ -7,7 +7,7 @@ import sys
 from dyfn_core.evaluation.report.html import text_table
 from dyfn_core.evaluation.sequence import score_table
 from dyfn_ros.replay.batch import expand, is_many, replay_all
-from dyfn_ros.replay.jobs import ALL, EXPECTED_ERRORS, PARTIAL, UNUSABLE, run_job, split
+from dyfn_ros.replay.jobs import EXPECTED_ERRORS, PARTIAL, UNUSABLE, code_of, run_job, split
 from dyfn_ros.replay.options import Command
 from dyfn_ros.replay.results import results_by_name
 from dyfn_ros.replay.run import ModelLoader, load
@@ -58,6 +58,8 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
         for text, count in notes[kind].items():
             times = f" ({count} times)" if count > 1 else ""
             print(f"dyfn-replay: {word}: {text}{times}", file=sys.stderr)
+    for text in metrics["warnings"]:
+        print(f"dyfn-replay: implausible: {text}", file=sys.stderr)
     print(f"{metrics['frames']} frames of {job.source.recording}")
     for text in metrics.get("state", {}).values():
         print(f"state: {text}")
@@ -65,4 +67,4 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
     written = [name for name in FILES.values() if (folder / name).exists()]
     listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
     print(f"results in {folder}: {listed}")
-    return PARTIAL if notes["losses"] else ALL
+    return code_of(job, metrics)

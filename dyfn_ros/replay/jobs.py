@@ -68,8 +68,17 @@ def outcome_of(job: ReplayJob, loader: ModelLoader) -> Outcome:
         return Outcome(UNUSABLE, str(error))
     except Exception as error:
         return Outcome(CRASHED, f"{type(error).__name__}: {error}", traceback.format_exc())
-    losses = metrics["recording"]["losses"]
-    return Outcome(PARTIAL if losses else ALL, "; ".join(losses))
+    return Outcome(code_of(job, metrics), "; ".join(_wrong(job, metrics)))
+
+
+def code_of(job: ReplayJob, metrics: dict[str, Any]) -> int:
+    """The exit code of a job that gave these results."""
+    return PARTIAL if _wrong(job, metrics) else ALL
+
+
+def _wrong(job: ReplayJob, metrics: dict[str, Any]) -> list[str]:
+    """What is not whole."""
+    return [*metrics["recording"]["losses"], *(metrics["warnings"] if job.strict else [])]
 
 
 def split(job: ReplayJob, topics: TopicChoice) -> list[ReplayJob]:
@@ -99,8 +108,9 @@ def _of_topic(job: ReplayJob, topic: str) -> ReplayJob:
     if isinstance(run, Run):
         own = path_for(run.stream.state_file, name, shared=True)
         run = replace(run, stream=replace(run.stream, state_file=own))
-    return ReplayJob(
-        replace(job.source, image_topic=topic),
-        run,
-        replace(job.outputs, folder=job.outputs.folder / name),
+    return replace(
+        job,
+        source=replace(job.source, image_topic=topic),
+        run=run,
+        outputs=replace(job.outputs, folder=job.outputs.folder / name),
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.argument_types import above_zero, at_least_one
+from dyfn_core.argument_types import above_zero, at_least_one, finite_above_zero
 from dyfn_core.cli.arguments import (
     Options,
     add_controls,
@@ -20,6 +20,7 @@ from dyfn_core.cli.arguments import (
     add_num_tokens,
     add_out,
     add_stabilize,
+    add_strict,
     add_stride,
     add_threads,
     command_parser,
@@ -43,7 +44,8 @@ from dyfn_ros.replay.settings import (
 )
 
 EPILOG = (
-    "Exit code: 0 everything was read, 3 part of the recording was damaged and the rest was used, "
+    "Exit code: 0 everything was read, 3 part of the recording was damaged and the rest was used "
+    "(with --strict also: the scores are implausible), "
     "2 nothing usable (the reason is on stderr). Of several recordings or topics: 0 all are whole, "
     "3 some are partial or failed, 2 none gave results."
 )
@@ -85,7 +87,8 @@ def parse(arguments: Sequence[str] | None = None) -> Command:
     scored = None if topic is None else PredictionTopic(topic, given["quantity"] or DEPTH)
     alone = names[0] if len(names) == 1 else None
     source = Source(recording=recordings[0], image_topic=alone, **_of(Source, given))
-    job = ReplayJob(source, scored or run, Outputs(given["out"], **_of(Outputs, given)))
+    outputs = Outputs(given["out"], **_of(Outputs, given))
+    job = ReplayJob(source, scored or run, outputs, given["strict"])
     topics = TopicChoice(() if alone else names, given["all_topics"])
     return Command(recordings, job, topics, BatchOptions(**_of(BatchOptions, given)))
 
@@ -200,6 +203,13 @@ def _add_source(group: Options) -> None:
         "metres",
     )
     add(
+        "--depth-scale",
+        type=finite_above_zero,
+        metavar="X",
+        help="stored depth values per metre (default: 1000 for 16UC1, 1 for 32FC1 and clouds, of a "
+        "folder by its layout)",
+    )
+    add(
         "--tolerance",
         type=above_zero,
         default=0.02,
@@ -299,6 +309,7 @@ def _add_outputs(group: Options) -> None:
         metavar="METRES",
         help="leave out ground truth and points of cloud.ply beyond this depth (default: none)",
     )
+    add_strict(group)
 
 
 def _add_batch(group: Options) -> None:

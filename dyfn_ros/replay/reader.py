@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
 from dyfn_core.metric.references import Reference
 from dyfn_core.quantities import DEPTH
+from dyfn_core.scoring.plausibility import Plausibility, Remedies
 from dyfn_ros.messages.references import message_references
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame
@@ -17,6 +19,13 @@ from dyfn_ros.recordings.reference_topic import ReferenceTopic
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording
 from dyfn_ros.replay.pose_feed import PoseFeed
 from dyfn_ros.replay.settings import SessionOptions, Source
+
+REMEDIES = Remedies(
+    unit="; --depth-scale gives the stored values per metre",
+    stamps="; --stamps log takes the time of recording",
+    truth="; --depth-topic names another, --depth-info-topic and --depth-transform register it",
+    camera="; --camera-info-topic none does without",
+)
 
 
 class ReferenceFeed:
@@ -72,14 +81,29 @@ class SourceReader:
             depth_transform=source.depth_transform,
             stamps=source.stamps,
             quantity=quantity,
+            depth_scale=source.depth_scale,
         )
         available = math.ceil(self.recording.expected_frames / source.stride)
         self.expected = min(available, source.max_frames or available)
+        self._remedies = replace(REMEDIES, stamps="") if source.stamps == "log" else REMEDIES
+        self._plausibility = Plausibility(self.expected, self._remedies)
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Every frame asked for, in the recording's order."""
+        self._plausibility = Plausibility(self.expected, self._remedies)
         frames = islice(self.recording.frames(), 0, None, self._source.stride)
-        return islice(frames, self._source.max_frames)
+        for frame in islice(frames, self._source.max_frames):
+            self._plausibility.push(frame.image, frame.depth, frame.stamp_ns, frame.camera_matrix)
+            yield frame
+
+    def doubts(self, scored: int) -> list[str]:
+        """What makes the scores of the frames implausible, a sentence each.
+
+        Args:
+            scored: How many of the frames were scored.
+        """
+        expected = None if self.recording.topics.depth is None else scored
+        return self._plausibility.warnings(expected)
 
     def references(self, options: SessionOptions) -> ReferenceFeed | None:
         """The measurements of the reference topic, from the first on.

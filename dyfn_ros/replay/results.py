@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dyfn_core.evaluation.report.cloud_view import CloudView
-from dyfn_core.evaluation.report.html import Section, Table, write_report
+from dyfn_core.evaluation.report.html import Cell, Section, Table, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import SequenceEvaluation
@@ -38,6 +38,7 @@ class Result:
         options: What the run adds to the `options` of metrics.json.
         cloud: Clouds for the report; None: no cloud.
         stream: What metrics.json has of the stream session.
+        doubts: What makes the scores implausible, see scoring.plausibility.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Result:
     options: dict[str, Any]
     cloud: CloudView | None
     stream: dict[str, Any] = field(default_factory=dict)
+    doubts: list[str] = field(default_factory=list)
 
 
 def write_results(
@@ -91,6 +93,7 @@ def _metrics(
         **({} if result.base is None else {"base": result.base.results()}),
         **({} if result.alone is None else {"without_odometry": result.alone.results()}),
         **result.stream,
+        "warnings": result.doubts,
         "recording": {
             "path": str(source.recording),
             "topics": vars(recording.topics),
@@ -103,6 +106,7 @@ def _metrics(
             "stamps": source.stamps,
             "tolerance": source.tolerance,
             "depth_transform": source.depth_transform,
+            "depth_scale": source.depth_scale,
             "depth_max": None if math.isinf(outputs.depth_max) else outputs.depth_max,
             **result.options,
         },
@@ -145,6 +149,9 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
     if notes:
         rows = [[text, count] for text, count in notes.items()]
         sections.insert(1, Section("Losses and warnings", [Table(("", "times"), rows)]))
+    if metrics["warnings"]:
+        doubts: list[list[Cell]] = [[text] for text in metrics["warnings"]]
+        sections.insert(1, Section("Implausible", [Table(("",), doubts)]))
     sections.append(Section("What was run", [Table(("", ""), facts)]))
     write_report(path, f"Replay of {Path(recording['path']).name}", sections)
 

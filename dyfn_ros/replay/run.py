@@ -90,7 +90,10 @@ def replay(
         reader.warn("--load-state: base model and controls started without the saved state")
     options = {**stream_facts(run), "threads": threads}
     facts = runner.facts()
-    result = Result(run.model, stabilized, evaluation, base, alone, options, files.cloud, facts)
+    doubts = reader.doubts(evaluation.scored_frames)
+    result = Result(
+        run.model, stabilized, evaluation, base, alone, options, files.cloud, facts, doubts
+    )
     return write_results(source, reader.recording, outputs, result)
 
 

@@ -39,7 +39,13 @@ def score_topic(source: Source, topic: PredictionTopic, outputs: Outputs) -> dic
     """
     reader = SourceReader(source)
     others = SourceReader(
-        replace(source, depth_topic=topic.topic, depth_info_topic=None, depth_transform=None),
+        replace(
+            source,
+            depth_topic=topic.topic,
+            depth_info_topic=None,
+            depth_transform=None,
+            depth_scale=None,
+        ),
         topic.quantity,
     )
     name = _recorded_name(topic, reader, others)
@@ -52,7 +58,8 @@ def score_topic(source: Source, topic: PredictionTopic, outputs: Outputs) -> dic
         "threads": 0,
         "predicted": topic.quantity,
     }
-    result = Result(topic.topic, False, evaluation, None, None, options, None)
+    doubts = reader.doubts(evaluation.scored_frames)
+    result = Result(topic.topic, False, evaluation, None, None, options, None, doubts=doubts)
     return write_results(source, reader.recording, outputs, result)
 
 

@@ -36,6 +36,7 @@ class Source:
         camera_info_topic: Its CameraInfo; None: found by type, "none": unknown intrinsics.
         depth_topic: Ground truth; None: found by type, "none": no scores.
         depth_info_topic: CameraInfo of a depth camera that is not the image's.
+        depth_scale: Stored depth values per metre; None: as the encoding or the layout says.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
         odometry_topic: Poses for metric_source "odometry", see recordings.poses.PoseTopic.
@@ -52,6 +53,7 @@ class Source:
     depth_topic: str | None = None
     depth_info_topic: str | None = None
     depth_transform: str | None = None
+    depth_scale: float | None = None
     reference_topic: str | None = None
     odometry_topic: str | None = None
     odometry_noise: OdometryNoise | None = None
@@ -156,11 +158,19 @@ class Outputs:
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """One image topic of one recording: what to read, what to run or score, what to write."""
+    """One image topic of one recording: what to read, what to run or score, what to write.
+
+    Attributes:
+        source: Frames and their truth.
+        run: What is run over them, or scored instead.
+        outputs: What is scored and written.
+        strict: Whether an implausible result counts as partial.
+    """
 
     source: Source
     run: Run | PredictionTopic
     outputs: Outputs
+    strict: bool = False
 
 
 @dataclass(frozen=True)

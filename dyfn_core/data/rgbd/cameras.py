@@ -10,10 +10,10 @@ import numpy as np
 
 from dyfn_core.data.files import SAME_ASPECT
 from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.geometry.camera import doubted_intrinsics
 
 Camera = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels, the first pixel's centre 0
 Size = tuple[int, int]  # rows, columns
-FOCAL_RANGE = (0.1, 10.0)  # focal lengths in units of the image's width that are believed
 SKEW = 1e-3  # relative to fx; more is refused
 EXPECTED = "a 3 x 3 (or 4 x 4) camera matrix [fx 0 cx; 0 fy cy; 0 0 1], or fx fy cx cy, in pixels"
 # The published calibrations of cameras whose folders come without one, of 640 x 480 pixels.
@@ -60,14 +60,9 @@ class FolderCamera:
                 )
             x, y = width / columns, height / rows
             fx, fy, cx, cy = fx * x, fy * y, (cx + 0.5) * x - 0.5, (cy + 0.5) * y - 0.5
-        inside = -0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5
-        low, high = (width * factor for factor in FOCAL_RANGE)
-        if not (inside and low <= min(fx, fy) and max(fx, fy) <= high):
-            raise FrameError(
-                f"{self.source}: fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} cannot be intrinsics in "
-                f"pixels of images of {width} x {height}: expected the principal point inside and "
-                f"focal lengths of {low:g} to {high:g}"
-            )
+        doubted = doubted_intrinsics((fx, fy, cx, cy), size)
+        if doubted:
+            raise FrameError(f"{self.source}: {doubted}")
         return fx, fy, cx, cy
 
 

@@ -55,6 +55,9 @@ def write_benchmark_report(
     if results["missing"]:
         rows = [[name] for name in results["missing"]]
         sections.append(Section("Not scored", [Table(("sequence",), rows)]))
+    if results["warnings"]:
+        doubts: list[list[Cell]] = [[text] for text in results["warnings"]]
+        sections.append(Section("Implausible", [Table(("",), doubts)]))
     for found in results["sequences"]:
         name = found["name"]
         parts = over_time(_sequence_variants(found))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -14,8 +14,9 @@ import numpy as np
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.pictures import BenchmarkPictures, SequencePictures
 from dyfn_core.evaluation.benchmarks.predictions import Method, Predict
-from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
+from dyfn_core.evaluation.benchmarks.registry import BenchmarkFrame, BenchmarkSequence, Opened
 from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
+from dyfn_core.scoring.plausibility import Plausibility
 from dyfn_core.scoring.protocols import CONTROLS, L1, SequenceScore, SequenceScorer, spread
 from dyfn_core.scoring.variants import VariantScorers
 
@@ -60,9 +61,12 @@ def score_sequence(
     """
     scorers = variant_scorers(method, depth_max, scoring)
     taken = None if pictures is None else pictures.begin(sequence)
+    plausibility = Plausibility(len(sequence.numbers))
     with TemporalScorer() as temporal:
         steady = temporal if scoring.temporal else None
-        frames = _push_all(sequence, method.open(sequence), scorers, depth_max, steady, taken)
+        observed = _observed(sequence, plausibility)
+        predict = method.open(sequence)
+        frames = _push_all(sequence.name, observed, predict, scorers, depth_max, steady, taken)
         variants = {name: _summary(scorer) for name, scorer in scorers.scorers.items()}
         steadiness: dict[str, Any] = {}
         if scoring.temporal:
@@ -80,6 +84,7 @@ def score_sequence(
         pictures.finish(taken, videos)
     for name, found in variants.items():
         found["temporal"] = steadiness.get(name)
+    scored = next(iter(variants.values()))["scored_frames"]
     return {
         "name": sequence.name,
         "frames": frames,
@@ -89,11 +94,19 @@ def score_sequence(
         "temporal_truth": steadiness.get(TRUTH),
         "variants": variants,
         "over_time": {name: _over_time(scorer) for name, scorer in scorers.scorers.items()},
+        "warnings": plausibility.warnings(scored),
     }
 
 
+def _observed(sequence: BenchmarkSequence, plausibility: Plausibility) -> Iterator[BenchmarkFrame]:
+    for frame in sequence.frames():
+        plausibility.push(frame.image, frame.truth, camera_matrix=frame.camera_matrix)
+        yield frame
+
+
 def _push_all(
-    sequence: BenchmarkSequence,
+    name: str,
+    frames: Iterator[BenchmarkFrame],
     predict: Predict,
     scorers: VariantScorers,
     depth_max: float,
@@ -101,12 +114,12 @@ def _push_all(
     taken: SequencePictures | None,
 ) -> int:
     count = 0
-    for count, frame in enumerate(sequence.frames(), start=1):
+    for count, frame in enumerate(frames, start=1):
         found = predict(count - 1, frame)
         try:
             maps = scorers.push(found, frame.truth)
         except ValueError as error:
-            raise FrameError(f"{sequence.name}, frame {count - 1}: {error}") from error
+            raise FrameError(f"{name}, frame {count - 1}: {error}") from error
         truth = np.where(frame.truth <= depth_max, frame.truth, np.float32(np.nan))
         if temporal is not None:
             temporal.push(frame.image, truth, maps, frame.camera_matrix, frame.pose)
@@ -174,6 +187,8 @@ def evaluate(
             continue
         done.append(found)
         note(_line(found))
+        for text in found["warnings"]:
+            note(f"{sequence.name}: implausible: {text}")
     if not done:
         raise DataError(f"no sequence could be scored: {'; '.join(missing)}")
     return {
@@ -185,6 +200,7 @@ def evaluate(
         "versions": versions(),
         "missing": missing,
         "problems": opened.report.problems,
+        "warnings": [f"{found['name']}: {text}" for found in done for text in found["warnings"]],
         "frames": sum(found["frames"] for found in done),
         "variants": mean_of([found["variants"] for found in done]),
         "temporal_truth": mean_of([found["temporal_truth"] for found in done]),
