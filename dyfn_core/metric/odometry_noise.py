@@ -19,12 +19,15 @@ class OdometryNoise:
         distance: random walk of the translation, a share of the distance moved (0.01: 1%).
         rotation: random walk of the orientation, degrees per square root of a metre moved.
         seed: of the random walk.
+        planar: the poses are of a base on a level floor (x forward, y left, z up): the random walks
+            are within the floor's plane, and turns are about its normal.
     """
 
     scale: float = 0.02
     distance: float = 0.01
     rotation: float = 0.2
     seed: int = 0
+    planar: bool = False
 
 
 class NoisyOdometry:
@@ -56,8 +59,11 @@ class NoisyOdometry:
     def _step(self, step: np.ndarray) -> np.ndarray:
         noise, length = self._noise, float(np.linalg.norm(step[:3, 3]))
         step[:3, 3] *= 1 + noise.scale
-        step[:3, 3] += self._draw.normal(0, noise.distance * length, 3)
+        walk = self._draw.normal(0, noise.distance * length, 3)
         turn = self._draw.normal(0, math.radians(noise.rotation) * math.sqrt(length), 3)
+        if noise.planar:
+            walk[2], turn[:2] = 0.0, 0.0
+        step[:3, 3] += walk
         step[:3, :3] = step[:3, :3] @ cv2.Rodrigues(turn)[0]
         return step
 

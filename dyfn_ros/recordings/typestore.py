@@ -14,6 +14,7 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 POSE = "geometry_msgs/msg/PoseStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
 FLOAT = "std_msgs/msg/Float64"
 
@@ -110,10 +111,47 @@ def compressed_message(data: np.ndarray, layout: str, stamp_ns: int, frame_id: s
 
 def pose_message(pose: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
     """A PoseStamped of a 4 x 4 camera-to-`frame_id`."""
+    return _new(POSE, header=header(stamp_ns, frame_id), pose=_pose(pose))
+
+
+def _pose(pose: np.ndarray) -> Any:
     x, y, z = (float(v) for v in pose[:3, 3])
     position = _new("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    placed = _new("geometry_msgs/msg/Pose", position=position, orientation=_quaternion(pose))
-    return _new(POSE, header=header(stamp_ns, frame_id), pose=placed)
+    return _new("geometry_msgs/msg/Pose", position=position, orientation=_quaternion(pose))
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What an odometry says at one moment.
+
+    pose: 4 x 4, points of the moving frame to the odometry's. twist: (6,) metres and radians a
+    second in the moving frame, linear x, y, z, then angular. covariances: 6 x 6 of both.
+    """
+
+    pose: np.ndarray
+    twist: np.ndarray
+    pose_covariance: np.ndarray
+    twist_covariance: np.ndarray
+
+
+def odometry_message(moved: Moved, stamp_ns: int, parent: str, child: str) -> Any:
+    """An Odometry of the frame `child` in the frame `parent`."""
+    linear, angular = (
+        _new("geometry_msgs/msg/Vector3", x=float(x), y=float(y), z=float(z))
+        for x, y, z in (moved.twist[:3], moved.twist[3:])
+    )
+    twist = _new("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+    covariances = (moved.pose_covariance, moved.twist_covariance)
+    of_pose, of_twist = (np.asarray(c, np.float64).reshape(36) for c in covariances)
+    return _new(
+        ODOMETRY,
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
+        pose=_new(
+            "geometry_msgs/msg/PoseWithCovariance", pose=_pose(moved.pose), covariance=of_pose
+        ),
+        twist=_new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=of_twist),
+    )
 
 
 def transform_message(pose: np.ndarray, stamp_ns: int, parent: str, child: str) -> Any:

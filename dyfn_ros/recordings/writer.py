@@ -14,7 +14,15 @@ from urllib.parse import quote
 import apsw
 import cv2
 import numpy as np
-from rosbags.interfaces import Connection
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
@@ -24,20 +32,36 @@ from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
+    ODOMETRY,
     POSE,
     TF,
     TYPES,
     Lens,
+    Moved,
     camera_info,
     compressed_message,
     depth_to_millimetres,
     image_message,
+    odometry_message,
     pose_message,
     transform_message,
 )
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 SUFFIXES = {".mcap": "mcap", ".db3": "sqlite3"}
+STATIC_TOPIC = "/tf_static"
+FOREVER = QosTime(9223372036, 854775807)
+LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    FOREVER,
+    FOREVER,
+    QosLiveliness.AUTOMATIC,
+    FOREVER,
+    False,
+)
 DepthEncoding = Literal["png", "16UC1", "32FC1"]
 
 
@@ -134,7 +158,10 @@ class RecordingWriter:
         """Write an already serialised (CDR) message."""
         connection = self._connections.get(topic)
         if connection is None:
-            connection = self._writer.add_connection(topic, kind, typestore=TYPES)
+            latched = [LATCHED] if topic == STATIC_TOPIC else []
+            connection = self._writer.add_connection(
+                topic, kind, typestore=TYPES, offered_qos_profiles=latched
+            )
             self._connections[topic] = connection
         if connection.msgtype != kind:
             raise RecordingError(f"topic {topic} holds {connection.msgtype}, not {kind}")
@@ -211,6 +238,18 @@ class RecordingWriter:
     ) -> None:
         """pose: 4 x 4, takes points of `child` to `parent`; written as a TFMessage."""
         self.write(topic, TF, transform_message(pose, stamp_ns, parent, child), stamp_ns)
+
+    def write_static_transform(
+        self, pose: np.ndarray, stamp_ns: int, parent: str, child: str
+    ) -> None:
+        """As write_transform, for ever: on /tf_static, which a player keeps for late listeners."""
+        self.write_transform(pose, stamp_ns, parent, child, STATIC_TOPIC)
+
+    def write_odometry(
+        self, topic: str, moved: Moved, stamp_ns: int, parent: str, child: str
+    ) -> None:
+        """moved: of the frame `child` in the frame `parent`."""
+        self.write(topic, ODOMETRY, odometry_message(moved, stamp_ns, parent, child), stamp_ns)
 
 
 # What rosbags' storages raise when the disk is full or gone.

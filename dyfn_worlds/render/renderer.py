@@ -176,6 +176,15 @@ class Renderer:
             *(o for a in self._actors for o in a.objects()),
         ]  # fmt: skip
 
+    def show(self, triangles: np.ndarray) -> None:
+        """Draws only these of the scene's triangles from now on, say those that may be in view.
+
+        triangles: T x 3 indices of the scene's vertices. Shadows stay those of the whole scene.
+        """
+        indices = self.ctx.buffer(np.ascontiguousarray(triangles, np.int32).tobytes())
+        self.meshes = self.vertex_arrays(self._scene_objects[0], indices)
+        self._scene_objects += [indices, *self.meshes]
+
     def draw(
         self,
         camera: RenderCamera,

@@ -53,6 +53,19 @@ def test_the_sky_is_infinite_and_a_wall_hides_it(renderer: Renderer) -> None:
     assert image[24, 60, 0] > image[24, 60, 1] + 20
 
 
+def test_only_the_shown_triangles_are_drawn_until_the_next_scene(renderer: Renderer) -> None:
+    builder = SceneBuilder()
+    white = builder.texture("white", np.full((4, 4, 3), 255, np.uint8))
+    for x in (2.0, 3.0):
+        builder.quad(np.array([[x, 9, -9], [x, -9, -9], [x, -9, 9], [x, 9, 9]]), white)
+    scene, camera = builder.build(), RenderCamera(pose_at(np.zeros(3), 0, 0, 0), (0.7, 0.9))
+    renderer.load(scene)
+    renderer.show(scene.triangles[2:])
+    np.testing.assert_allclose(renderer.draw(camera).depth, 3.0, rtol=1e-5)
+    renderer.load(scene)
+    np.testing.assert_allclose(renderer.draw(camera).depth, 2.0, rtol=1e-5)
+
+
 def test_a_shadow_falls_behind_what_stands_in_the_light(renderer: Renderer) -> None:
     builder = SceneBuilder()
     white = builder.texture("white", np.full((4, 4, 3), 255, np.uint8))

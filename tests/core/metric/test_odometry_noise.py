@@ -43,3 +43,18 @@ def test_seed_decides_the_draws_and_the_first_pose_is_true() -> None:
 def test_without_errors_the_poses_are_the_true_ones() -> None:
     made = noisy_poses(POSES[:50], OdometryNoise(0.0, 0.0, 0.0))
     np.testing.assert_allclose(made, POSES[:50], atol=1e-12)
+
+
+def test_planar_noise_stays_on_the_floor() -> None:
+    floor = []
+    for i in range(400):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(np.array([0.0, 0.0, 0.01 * i]))[0]
+        pose[:2, 3] = STEP * i * np.cos(0.005 * i), STEP * i * np.sin(0.005 * i)
+        floor.append(pose)
+    made = np.array(noisy_poses(floor, OdometryNoise(seed=2, planar=True)))
+    assert np.abs(made[:, 2, 3]).max() == 0.0
+    np.testing.assert_allclose(made[:, 2, :3], np.tile([0, 0, 1], (400, 1)), atol=1e-12)
+    turned = [np.arctan2(p[1, 0], p[0, 0]) - np.arctan2(q[1, 0], q[0, 0])
+              for p, q in zip(made, floor, strict=True)]  # fmt: skip
+    assert np.degrees(np.abs(np.unwrap(turned)).max()) > 0.5
