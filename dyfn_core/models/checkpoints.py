@@ -44,6 +44,7 @@ BUNDLED = {
     "dyfn-mini": "dyfn-mini.safetensors",
     "dyfn-mini-5": "dyfn-mini.safetensors",  # the default by its version
     "dyfn-mini-6": "dyfn-mini-6.safetensors",
+    "dyfn-mini-7": "dyfn-mini-7.safetensors",
 }
 HUB_FILES = {
     "shawlyu/dyfn": "DyFN.pt",
