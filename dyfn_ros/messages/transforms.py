@@ -37,12 +37,14 @@ class TransformBuffer:
     Attributes:
         counts: Transforms that could not be used, by reason.
         changed: Notified when something has come; its lock is the buffer's.
+        note: Why nothing comes, for errors; "" when something may.
     """
 
     def __init__(self, limits: PoseLimits | None = None) -> None:
         """limits: Of each transform that moves."""
         self.counts: Counter[str] = Counter()
         self.changed = threading.Condition(threading.RLock())
+        self.note = ""
         self._limits = limits or PoseLimits()
         self._moving: dict[str, _Link] = {}
         self._static: dict[str, _Link] = {}
@@ -179,6 +181,7 @@ class TransformBuffer:
         for chain in (one, other):
             if chain[0] not in known:
                 listed = ", ".join(sorted(known)) or "none"
+                listed += f"; {self.note}" if self.note else ""
                 return f"tf has no frame {chain[0]!r} (it has: {listed})"
         return (
             f"tf does not connect {one[0]!r} (below {one[-1]!r}) with {other[0]!r} "

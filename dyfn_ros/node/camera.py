@@ -20,6 +20,7 @@ from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.images import MessageError, decode_image
 from dyfn_ros.messages.rectify import Rectifier, RectifyRules
 from dyfn_ros.node.metric_scale import ScaleTopics
+from dyfn_ros.node.odometry import OdometryTopic, TransformTopics
 from dyfn_ros.node.outputs import NodeOutputs
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.statistics import FrameStatistics
@@ -52,8 +53,8 @@ class Camera:
     """The callbacks only store and `submit`; the inference thread calls the other methods.
 
     name: "" for a camera without a name of its own. settings: the values in force, asked for
-    each frame. submit: takes a Job, -> whether it was accepted. release: a CameraInfo has come.
-    warn: for what costs a frame its use.
+    each frame. transforms: of all cameras. submit: takes a Job, -> whether it was accepted.
+    release: a CameraInfo has come. warn: for what costs a frame its use.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Camera:
         ports: NodeTopics,
         name: str,
         settings: Callable[[], NodeSettings],
+        transforms: TransformTopics,
         submit: Callable[[FrameJob], bool],
         release: Callable[[], None],
         warn: Say,
@@ -80,6 +82,7 @@ class Camera:
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
         self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings())
+        self.odometry = OdometryTopic(ports, self.prefix, settings(), transforms)
 
     @property
     def prefix(self) -> str:
@@ -193,6 +196,7 @@ class Camera:
         session = StreamSession(model, self.settings)
         _ = session.fingerprint  # takes seconds for a large model, which nobody waits for here
         self.scale_topics.open(session, self.settings, self._warn)
+        self.odometry.open(self.settings, self._warn)
         self.session = session
 
     def decode(self, job: FrameJob) -> tuple[Frame, CameraInfo | None]:
@@ -225,9 +229,10 @@ class Camera:
         session.options = self.settings
         return session.begin(frame, asked)
 
-    def end(self, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
+    def end(self, job: FrameJob, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
         """-> what to publish."""
-        session = self._opened()
+        session, until = self._opened(), job.arrived + self.settings.odometry_wait
+        frame = self.odometry.placed(frame, job.message.header, until)
         found = session.end(frame, prediction)
         self.scale_topics.publish(session.scale)
         return found

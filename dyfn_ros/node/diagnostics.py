@@ -92,6 +92,7 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     if camera.session is not None:
         values.update(camera.session.report())
     values.update(camera.scale_topics.report())
+    values.update(camera.odometry.report())
     problems = _camera_problems(report, camera, snapshot)
     return _status(f"{report.name}: {camera.name or 'camera'}", problems, report.phase, values)
 
@@ -124,6 +125,7 @@ def _camera_problems(
         problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
     if camera.session is not None:
         problems += [(WARN, text) for text in camera.session.problems()]
+    problems += [(WARN, text) for text in camera.odometry.problems()]
     return problems
 
 

@@ -81,6 +81,7 @@ def _predict(group: list[_Begun]) -> list[Prediction]:
 def _publish(one: _Begun, prediction: Prediction) -> None:
     camera = one.job.camera
     try:
-        camera.publish(one.job, one.frame, one.info, camera.end(one.frame, prediction))
+        found = camera.end(one.job, one.frame, prediction)
+        camera.publish(one.job, one.frame, one.info, found)
     except Exception as error:
         camera.failed(one.job, error)

@@ -23,6 +23,7 @@ from dyfn_ros.node.camera import Camera, FrameJob
 from dyfn_ros.node.diagnostics import Report, node_diagnostics
 from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
+from dyfn_ros.node.odometry import TransformTopics
 from dyfn_ros.node.parameters.declare import NodeParameters
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.service_guard import guard_services
@@ -118,7 +119,10 @@ class StreamDepthNode(LifecycleNode):
             capacity=settings.queue_size,
             held=[self._table.camera(name).wait_for_camera_info for name in settings.cameras],
         )
-        self._cameras = [self._make_camera(i, name) for i, name in enumerate(settings.cameras)]
+        transforms = TransformTopics(self._ports, settings)
+        self._cameras = [
+            self._make_camera(i, name, transforms) for i, name in enumerate(settings.cameras)
+        ]
         self._make_services()
         self._worker.start()
         while not self._interrupted and not self._worker.wait_prepared(_POLL):
@@ -194,7 +198,7 @@ class StreamDepthNode(LifecycleNode):
 
     # What a configured node is made of.
 
-    def _make_camera(self, index: int, name: str) -> Camera:
+    def _make_camera(self, index: int, name: str, transforms: TransformTopics) -> Camera:
         worker = self._worker
         assert worker is not None
         return Camera(
@@ -202,6 +206,7 @@ class StreamDepthNode(LifecycleNode):
             self._ports,
             name,
             partial(self._table.camera, name),
+            transforms,
             submit=lambda job: worker.submit(job, index),
             release=lambda: worker.release(index),
             warn=self._warn,

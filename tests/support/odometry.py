@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+import sys
+from importlib.util import find_spec
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -103,6 +105,28 @@ def transform(pose: np.ndarray, seconds: float, parent: str, child: str) -> Tran
     x, y, z = (float(v) for v in pose[:3, 3])
     message.transform = Transform(translation=Vector3(x=x, y=y, z=z), rotation=_quaternion(pose))
     return message
+
+
+def use_tf_stand_in() -> None:
+    """Where tf2_msgs is not installed (no wheels have it), /tf carries one TransformStamped each.
+
+    For the node's process; `tf_topic` sends accordingly.
+    """
+    if find_spec("tf2_msgs") is not None:
+        return
+    TransformStamped.transforms = property(lambda self: [self])
+    package, messages = ModuleType("tf2_msgs"), ModuleType("tf2_msgs.msg")
+    package.msg, messages.TFMessage = messages, TransformStamped  # type: ignore[attr-defined]
+    sys.modules.update({"tf2_msgs": package, "tf2_msgs.msg": messages})
+
+
+def tf_topic(transform: TransformStamped) -> Any:
+    """What a publisher of /tf sends to such a node."""
+    if find_spec("tf2_msgs") is None:
+        return transform
+    from tf2_msgs.msg import TFMessage
+
+    return TFMessage(transforms=[transform])
 
 
 def tf_message(*transforms: TransformStamped) -> Any:

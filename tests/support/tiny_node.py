@@ -9,6 +9,7 @@ import threading
 from typing import TYPE_CHECKING
 
 from dyfn_ros.node.main import main
+from tests.support.odometry import use_tf_stand_in
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -50,4 +51,5 @@ def die_with_parent() -> None:
 
 if __name__ == "__main__":
     die_with_parent()
+    use_tf_stand_in()
     main(load=load)

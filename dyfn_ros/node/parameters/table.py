@@ -9,6 +9,7 @@ from typing import Any
 
 from dyfn_core.stream.options import SCALE, STREAM, StreamOptions
 from dyfn_core.threads import THREADS
+from dyfn_ros.messages.odometry_options import OdometryOptions
 from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.node.parameters.spec import CONFIGURE, MARKS, RUN, START, Spec, spec_of
 from dyfn_ros.node.parameters.spec import parameter as _parameter
@@ -30,7 +31,7 @@ _NODE, _INPUT, _OUTPUT, _CLOUD = "Node", "Input", "Output", "Cloud"
 
 
 @dataclass(frozen=True)
-class NodeSettings(ReferenceOptions, StreamOptions):
+class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
     """The values in force; a new one for each change. The fields are the table."""
 
     cameras: list[str] = _parameter(

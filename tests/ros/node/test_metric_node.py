@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
@@ -19,6 +20,7 @@ from std_srvs.srv import Trigger
 
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.clouds import cloud_points
+from tests.support.odometry import base_pose, odometry
 from tests.support.points import cloud_message
 from tests.support.ros_graph import (
     NODE,
@@ -149,6 +151,32 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
     assert client.set_parameter("after_reset", "withhold").successful
     client.reset()
     assert np.isnan(depth_of(client.result(client.send(picture)))).all()
+
+
+def test_odometry_without_the_camera_s_place_is_said_and_depth_goes_on(bench: Bench) -> None:
+    client = bench.start(metric_source="odometry", until_metric="relative")
+    found: list[DiagnosticArray] = []
+    client.subscriptions.append(
+        client.node.create_subscription(DiagnosticArray, "/diagnostics", found.append, RELIABLE)
+    )
+    publisher = client.node.create_publisher(Odometry, "odometry", RELIABLE)
+    client.wait(lambda: publisher.get_subscription_count() == 1)
+    for offset in (-0.1, 0.1):
+        publisher.publish(odometry(base_pose(offset), client._stamp + 1.5 + offset))
+    client.settle()
+    assert np.isfinite(depth_of(client.result(client.send(frames(1)[0])))).any()
+    bench.nodes[-1].wait_log(r"/odometry: no pose of the camera: the odometry is of 'base_link'")
+    for words in ("the images are of 'optical'", "tf has no frame", "set camera_pose"):
+        bench.nodes[-1].wait_log(words)
+
+    def told() -> dict[str, str]:
+        statuses = [status for message in found for status in message.status]
+        return {one.key: one.value for one in statuses[-1].values} if statuses else {}
+
+    key = "odometry: no pose, camera's place unknown"
+    client.wait(lambda: told().get(key) == "1")
+    assert told()["odometry: frames"] == "base_link in odom"
+    assert told()["odometry: topic"] == "/odometry"
 
 
 def test_fixed_scale_multiplies_depth_and_a_scene_cut_resets_the_stream(bench: Bench) -> None:

@@ -13,17 +13,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import TransformStamped
 from mcap.reader import make_reader
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
 
+from dyfn_core.geometry.rigid import between, inverse
 from dyfn_core.models.base import GeometryModel
 from dyfn_ros.messages.images import decode_depth
-from dyfn_ros.recordings.typestore import IMAGE, TYPES
+from dyfn_ros.recordings.typestore import IMAGE, TF, TYPES
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL
+from tests.support.odometry import MOUNT, odometry, pose_text, tf_message, tf_topic, transform
 from tests.support.pinhole import FOV_X, PinholeModel
 from tests.support.points import cloud_message
 from tests.support.ros_graph import (
@@ -36,11 +41,18 @@ from tests.support.ros_graph import (
     own_domain,
     tiny_node,
 )
+from tests.support.textured_plane import CAMERA, SIZE, plane_view, texture, walk
 from tests.support.tiny_model import load_tiny
 
-TOPICS = {Image: "image", CameraInfo: "camera_info", PointCloud2: "cloud"}
+TOPICS = {
+    **{Image: "image", CameraInfo: "camera_info", PointCloud2: "cloud"},
+    **{Odometry: "odom", TransformStamped: "tf_static"},
+}
 KINDS = {kind: f"sensor_msgs/msg/{kind.__name__}" for kind in TOPICS}
-Message = Image | PointCloud2
+KINDS |= {Odometry: "nav_msgs/msg/Odometry", TransformStamped: TF}
+LISTENED = {PointCloud2: "reference", Odometry: "odometry", TransformStamped: "/tf_static"}
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+Message = Image | PointCloud2 | Odometry | TransformStamped
 
 
 def load(name: str, device: str) -> GeometryModel:
@@ -61,7 +73,10 @@ def images(seconds: list[int], pictures: list[np.ndarray]) -> list[Message]:
 def record(path: Path, info: CameraInfo, messages: list[Message]) -> Path:
     with RecordingWriter(path, overwrite=True) as writer:
         for number, message in enumerate([info, *messages]):
-            data = bytes(serialize_message(message))
+            if isinstance(message, TransformStamped):
+                data = bytes(TYPES.serialize_cdr(tf_message(message), TF))
+            else:
+                data = bytes(serialize_message(message))
             writer.write_cdr(f"/{TOPICS[type(message)]}", KINDS[type(message)], data, number)
     return path
 
@@ -74,6 +89,7 @@ class Session:
     client: Client
     options: dict[str, Any]
     info: CameraInfo = field(default_factory=camera_info)
+    publishers: dict[type, Any] = field(default_factory=dict)
 
     def call(self, name: str) -> str:
         response = self.client._call(
@@ -94,14 +110,20 @@ class Session:
                 result = self.client.result(message.header.stamp.sec)
                 found.append(decode_depth(result["depth/image"]).tobytes())
             else:
-                self.publisher(type(message)).publish(message)
+                kind, static = type(message), isinstance(message, TransformStamped)
+                if isinstance(message, TransformStamped):
+                    message = tf_topic(message)
+                self.publisher(kind, type(message), static).publish(message)
         return found
 
-    def publisher(self, kind: type) -> Any:
-        if not hasattr(self, "_publisher"):
-            self._publisher = self.client.node.create_publisher(kind, "reference", RELIABLE)
-            self.client.wait(lambda: self._publisher.get_subscription_count() == 1)
-        return self._publisher
+    def publisher(self, kind: type, sent: type, static: bool) -> Any:
+        if kind not in self.publishers:
+            qos = LATCHED if static else RELIABLE
+            made = self.client.node.create_publisher(sent, LISTENED[kind], qos)
+            self.publishers[kind] = made
+            self.client.wait(lambda: made.get_subscription_count() == 1)
+            self.call("reset")  # by a new client: who answers it has seen the publisher before it
+        return self.publishers[kind]
 
     def replay(self, messages: list[Message], *more: str) -> tuple[list[bytes], dict[str, Any]]:
         """dyfn-replay's depth of every image, and its metrics.json."""
@@ -238,6 +260,48 @@ def test_the_camera_height(session: Callable[..., Session]) -> None:
     offline, metrics = bench.replay(sent)
     assert live == offline and finite(offline[-1])
     assert float(metrics["metric_scale"]["scale"]) == pytest.approx(3.0, rel=0.1)
+
+
+def plane_walk(bench: Session, count: int) -> tuple[list[Message], list[Message]]:
+    """Images along a plane at 1 Hz, and the odometry of the base before and after each of them."""
+    focal = SIZE[1] / 2 / np.tan(np.radians(FOV_X / 2))
+    camera = np.array([[focal, 0, CAMERA[0, 2]], [0, focal, CAMERA[1, 2]], [0, 0, 1]])
+    bench.info = CameraInfo(height=SIZE[0], width=SIZE[1], k=camera.reshape(9))
+    bench.info.p = np.insert(camera, 3, 0.0, axis=1).reshape(12)
+    poses, whole = walk(count + 2), texture()
+    pictures, bodies = [], []
+    for index in range(1, count + 1):
+        view = plane_view(poses[index], whole, camera)
+        picture = np.zeros((*SIZE, 3), np.uint8)
+        picture[..., 0] = np.round((view.depth / 3 - 0.5) * 255)
+        picture[..., 1] = view.image[..., 1]
+        pictures.append(picture)
+        for rest in (-0.4, -0.1, 0.2, 0.45):
+            near = poses[index + (1 if rest > 0 else -1)]
+            pose = between(poses[index], near, abs(rest)) @ inverse(MOUNT)
+            bodies.append(odometry(pose, 10 + index + rest))
+    return images(list(range(11, 11 + count)), pictures), bodies
+
+
+@pytest.mark.parametrize("by_parameter", [False, True])
+def test_odometry(session: Callable[..., Session], by_parameter: bool) -> None:
+    """Of a base that carries the camera: its place by /tf_static, or by parameter."""
+    place = {"camera_pose": pose_text(MOUNT)} if by_parameter else {}
+    bench = session(model="pinhole", metric_source="odometry", **place)
+    pictures, bodies = plane_walk(bench, 12)
+    sent: list[Message] = []
+    if not by_parameter:
+        sent.append(transform(MOUNT, 0, "base_link", "optical"))
+    for index, picture in enumerate(pictures):
+        sent += [*bodies[4 * index : 4 * index + 4], picture]
+    live = bench.live(sent)
+    offline, metrics = bench.replay(sent)
+    assert live == offline
+    assert metrics["odometry"]["camera's place"] == ("camera_pose" if by_parameter else "tf")
+    assert metrics["odometry"]["images with a pose"] == "12"
+    assert metrics["metric_scale"]["unit"] == "metres"
+    assert float(metrics["metric_scale"]["scale"]) == pytest.approx(3.0, rel=0.1)
+    assert not finite(offline[0]) and finite(offline[-1])
 
 
 def test_a_saved_state(session: Callable[..., Session], tmp_path: Path) -> None:
