@@ -69,7 +69,8 @@ class SequenceEvaluation:
         self.worst = WorstFrames(expected_frames, quantity)
         self._stamps, self._latencies = array("d"), array("d")  # seconds
         self._metric = array("b")
-        self._metres = SequenceScorer(depth_max)
+        self._metres: SequenceScorer | None = None  # from the first frame in metres on
+        self._depth_max = depth_max
         self._hash = hashlib.sha256()
 
     def push(
@@ -104,7 +105,7 @@ class SequenceEvaluation:
         if truth is None:
             nothing = np.full((1, 1), np.nan, np.float32)
             self._scorers.push({PREDICTION: nothing}, nothing)
-            self._metres.push(nothing, nothing)
+            self._push_metres(None, nothing)
             return self.scorer.frames[-1]
         self._scorers.push({PREDICTION: masked}, truth)
         score = self.scorer.frames[-1]
@@ -113,8 +114,15 @@ class SequenceEvaluation:
         return score
 
     def _push_metres(self, metres: np.ndarray | None, truth: np.ndarray) -> None:
+        nothing = np.full((1, 1), np.nan, np.float32)
+        if self._metres is None and metres is not None:
+            self._metres = SequenceScorer(self._depth_max)
+            for _ in range(self.frames - 1):
+                self._metres.push(nothing, nothing)
+        if self._metres is None:
+            return
         if metres is None:
-            metres = truth = np.full((1, 1), np.nan, np.float32)
+            metres = truth = nothing
         self._metres.push(to_shape(metres, truth.shape), truth)
 
     @property
@@ -155,7 +163,7 @@ class SequenceEvaluation:
 
         None when no frame was in metres, or there is no truth.
         """
-        score = self._metres.metric() if self.metric_frames else None
+        score = None if self._metres is None else self._metres.metric()
         if score is None:
             return None
         rows = MetricRows()
