@@ -84,6 +84,38 @@ def encode_compressed_depth(
     return f"{encoding}; compressedDepth png", _HEADER.pack(0, a, b) + data.tobytes()
 
 
+PRECISION = 1e-4  # largest relative error of encode_depth_range, up to RATIO
+RATIO = 1 + 65_534 * 2 * PRECISION  # farthest over nearest depth; beyond it the error grows with it
+
+
+def encode_depth_range(depth: np.ndarray, valid: np.ndarray) -> tuple[str, bytes, float]:
+    """The same with a and b of this image's own range, so that no valid pixel is left out.
+
+    Args:
+        depth: H x W, in any unit.
+        valid: H x W bool; depth is finite and positive there.
+
+    Returns:
+        `format`, `data`, and the largest relative error, at the farthest pixel: PRECISION, or
+        farthest / nearest / 131 068 where that is more. Nearer pixels have less of it.
+
+    Raises:
+        MessageError: The image cannot be compressed.
+    """
+    found = depth[valid].astype(np.float64)
+    near, far = (float(found.min()), float(found.max())) if found.size else (1.0, 1.0)
+    steps = min((far / near - 1) / (2 * PRECISION), 65_534.0)
+    a = steps / (1 / near - 1 / far) if far > near else far / (2 * PRECISION)
+    a, b = (float(np.float32(value)) for value in (a, 1 - a / far))
+    codes = np.rint(a / np.where(valid, depth.astype(np.float64), np.inf) + b)
+    values = np.where(valid, codes.clip(1, 65_535), 0).astype(np.uint16)
+    ok, data = cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not ok:
+        raise MessageError(f"a depth image of {depth.shape} could not be compressed")
+    packed = _HEADER.pack(0, a, b) + data.tobytes()
+    return "32FC1; compressedDepth png", packed, far / (2 * a)
+
+
 def _rvl(layout: str, data: bytes) -> np.ndarray:
     try:
         return decode_rvl(data)

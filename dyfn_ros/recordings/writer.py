@@ -175,12 +175,21 @@ class RecordingWriter:
         self.write(topic, IMAGE, image_message(image, "rgb8", stamp_ns, frame_id), stamp_ns)
 
     def write_jpeg(
-        self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str, quality: int = 90
+        self,
+        topic: str,
+        image: np.ndarray,
+        stamp_ns: int,
+        frame_id: str,
+        quality: int = 90,
+        log_ns: int | None = None,
     ) -> None:
-        """image: H x W x 3 uint8 RGB, written as a JPEG CompressedImage."""
+        """image: H x W x 3 uint8 RGB, written as a JPEG CompressedImage.
+
+        log_ns: time of recording; None: the stamp.
+        """
         data = _encode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
         message = compressed_message(data, "rgb8; jpeg compressed bgr8", stamp_ns, frame_id)
-        self.write(topic, COMPRESSED_IMAGE, message, stamp_ns)
+        self.write(topic, COMPRESSED_IMAGE, message, stamp_ns if log_ns is None else log_ns)
 
     def write_png(self, topic: str, image: np.ndarray, stamp_ns: int, frame_id: str) -> None:
         """image: H x W x 3 uint8 RGB, written as a lossless PNG CompressedImage."""
@@ -228,16 +237,36 @@ class RecordingWriter:
         message = camera_info(camera_matrix, size, stamp_ns, frame_id, lens)
         self.write(topic, CAMERA_INFO, message, stamp_ns)
 
-    def write_pose(self, topic: str, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
-        """pose: 4 x 4 camera-to-`frame_id`, written as PoseStamped."""
+    def write_pose(
+        self,
+        topic: str,
+        pose: np.ndarray,
+        stamp_ns: int,
+        frame_id: str,
+        log_ns: int | None = None,
+    ) -> None:
+        """pose: 4 x 4 camera-to-`frame_id`, written as PoseStamped.
+
+        log_ns: time of recording; None: the stamp.
+        """
         message = pose_message(pose, stamp_ns, frame_id)
-        self.write(topic, POSE, message, stamp_ns)
+        self.write(topic, POSE, message, stamp_ns if log_ns is None else log_ns)
 
     def write_transform(
-        self, pose: np.ndarray, stamp_ns: int, parent: str, child: str, topic: str = "/tf"
+        self,
+        pose: np.ndarray,
+        stamp_ns: int,
+        parent: str,
+        child: str,
+        topic: str = "/tf",
+        log_ns: int | None = None,
     ) -> None:
-        """pose: 4 x 4, takes points of `child` to `parent`; written as a TFMessage."""
-        self.write(topic, TF, transform_message(pose, stamp_ns, parent, child), stamp_ns)
+        """pose: 4 x 4, takes points of `child` to `parent`; written as a TFMessage.
+
+        log_ns: time of recording; None: the stamp.
+        """
+        message = transform_message(pose, stamp_ns, parent, child)
+        self.write(topic, TF, message, stamp_ns if log_ns is None else log_ns)
 
     def write_static_transform(
         self, pose: np.ndarray, stamp_ns: int, parent: str, child: str

@@ -64,7 +64,7 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
     for text in metrics.get("state", {}).values():
         print(f"state: {text}")
     print(text_table(score_table(results_by_name(metrics))))
-    written = [name for name in FILES.values() if (folder / name).exists()]
+    written = [name for name in dict.fromkeys(FILES.values()) if (folder / name).exists()]
     listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
     print(f"results in {folder}: {listed}")
     return code_of(job, metrics)

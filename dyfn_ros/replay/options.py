@@ -286,7 +286,8 @@ def _add_outputs(group: Options) -> None:
         type=_outputs,
         default=DEFAULT,
         metavar="LIST",
-        help=f"files beside scores and report: some of {','.join(FILES)}, or none "
+        help=f"files beside scores and report: some of {','.join(FILES)}, or none; raw: "
+        "output.mcap with depth that is not compressed "
         "(default: mcap,ply, and video where the extra `video` is installed)",
     )
     add("--no-output-recording", dest="write", action="store_const", const=(), help="--write none")

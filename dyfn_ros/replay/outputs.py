@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -20,9 +20,18 @@ from dyfn_ros.replay.cloud import FusedCloud, cloud_view, write_cloud
 from dyfn_ros.replay.frame_spool import FrameSpool
 from dyfn_ros.replay.mcap import ReplayRecording
 from dyfn_ros.replay.rerun import RerunRecording
-from dyfn_ros.replay.settings import FILES, MCAP, NONE, PLY, RRD, VIDEO, Outputs
+from dyfn_ros.replay.settings import FILES, LAYOUT, MCAP, NONE, PLY, RAW, RRD, VIDEO, Outputs
 from dyfn_ros.replay.shown_run import ShownRun
 from dyfn_ros.replay.video import write_video
+
+
+@contextmanager
+def _written(path: Path) -> Iterator[None]:
+    """Names the file that cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from error
 
 
 class _Writer(Protocol):
@@ -54,20 +63,22 @@ class ReplayOutputs:
         self._poses: PoseLookup | None = None
         self._notes: list[str] = []
         self._fuse = PLY in options.write
-        self._done = {MCAP, RRD} & set(options.write)
+        self._posed = bool({MCAP, RAW, PLY} & set(options.write))
+        self._mcap: ReplayRecording | None = None
+        self._done = {MCAP, RAW, RRD} & set(options.write)
         self._stack = ExitStack()
         self.cloud: CloudView | None = None
 
     def __enter__(self) -> ReplayOutputs:
         with ExitStack() as stack:
-            if MCAP in self._options.write:
-                path = self._folder / FILES[MCAP]
-                self._writers.append((path, stack.enter_context(ReplayRecording(path))))
+            if {MCAP, RAW} & set(self._options.write):
+                path, raw = self._folder / FILES[MCAP], RAW in self._options.write
+                self._mcap = stack.enter_context(ReplayRecording(path, raw=raw))
             if RRD in self._options.write:
                 path = self._folder / FILES[RRD]
                 rerun = RerunRecording(path, self._recording.name)
                 self._writers.append((path, stack.enter_context(rerun)))
-            if {PLY, VIDEO} & set(self._options.write):
+            if {MCAP, PLY, VIDEO} & set(self._options.write):
                 self._spool = stack.enter_context(FrameSpool(self._folder))
             self._stack = stack.pop_all()
         return self
@@ -83,20 +94,24 @@ class ReplayOutputs:
         except OSError as problem:
             raise cannot_write(self._folder, problem) from problem
         if kind is None:
-            for name in FILES.keys() - self._done:  # of an earlier run: not of these frames
-                (self._folder / FILES[name]).unlink(missing_ok=True)
+            if self._mcap is not None:
+                self._mcap.write_layout(self._folder / LAYOUT)
+            made = {FILES[name] for name in self._done} | ({LAYOUT} if self._mcap else set())
+            for name in {*FILES.values(), LAYOUT} - made:  # of an earlier run, not of these frames
+                (self._folder / name).unlink(missing_ok=True)
 
     def write(
         self, frame: RecordedFrame, prediction: Prediction[np.ndarray], score: FrameScore
     ) -> None:
         """One frame, in order."""
+        pose = self._pose(frame) if self._posed else None
+        if self._mcap is not None:
+            with _written(self._folder / FILES[MCAP]):
+                self._mcap.write(frame, prediction, score, pose)
         for path, writer in self._writers:
-            try:
+            with _written(path):
                 writer.write(frame, prediction, score)
-            except OSError as error:
-                raise cannot_write(path, error) from error
         if self._spool is not None:
-            pose = self._pose(frame) if self._fuse else None
             self._spool.push(frame, prediction, pose)
 
     def write_base(self, prediction: Prediction[np.ndarray]) -> None:
@@ -111,6 +126,11 @@ class ReplayOutputs:
             runs: The run; and the base model's, where write_base took it.
         """
         spool, fused = self._spool, None
+        if self._mcap is not None:
+            with _written(self._folder / FILES[MCAP]):
+                raw = RAW in self._options.write
+                self._mcap.finish(None if raw else spool, runs[0])
+            self._notes += self._mcap.notes
         if spool is not None and spool.frames:
             if VIDEO in self._options.write:
                 write_video(self._folder / FILES[VIDEO], spool, runs)
@@ -143,7 +163,8 @@ class ReplayOutputs:
             except PoseError as error:
                 if topic not in (None, NONE):
                     raise
-                self._fuse = False
-                self._notes.append(f"no cloud.ply: {error}")
+                if self._fuse:
+                    self._notes.append(f"no cloud.ply: {error}")
+                self._fuse = self._posed = False
                 return None
         return self._poses(frame.index, frame.stamp_ns)

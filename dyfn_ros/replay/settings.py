@@ -18,8 +18,15 @@ from dyfn_core.threads import THREADS
 from dyfn_ros.messages.odometry_options import OdometryOptions
 from dyfn_ros.messages.reference_options import ReferenceOptions
 
-MCAP, PLY, VIDEO, RRD = "mcap", "ply", "video", "rrd"
-FILES = {MCAP: "output.mcap", PLY: "cloud.ply", VIDEO: "video.mp4", RRD: "output.rrd"}
+MCAP, RAW, PLY, VIDEO, RRD = "mcap", "raw", "ply", "video", "rrd"
+FILES = {
+    MCAP: "output.mcap",
+    RAW: "output.mcap",  # with depth and clouds as they were predicted
+    PLY: "cloud.ply",
+    VIDEO: "video.mp4",
+    RRD: "output.rrd",
+}
+LAYOUT = "output.foxglove.json"  # beside output.mcap
 # The video is a default only where the extra `video` is installed.
 DEFAULT = (MCAP, PLY, VIDEO) if importlib.util.find_spec("av") else (MCAP, PLY)
 NONE = "none"

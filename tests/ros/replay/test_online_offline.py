@@ -61,7 +61,7 @@ def offline(folder: Path) -> dict[str, Path]:
         str(folder / "walk"),
         str(folder / "rest"),
     ]
-    options = ["--out", str(folder / "offline"), "--write", "mcap"]
+    options = ["--out", str(folder / "offline"), "--write", "raw"]
     subprocess.run([*command, *options], check=True, stdout=subprocess.DEVNULL, timeout=DEADLINE)
     return {name: folder / "offline" / name for name in ("walk", "rest")}
 

@@ -65,6 +65,7 @@ def test_it_writes_everything(recording: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "frames.csv",
         "metrics.json",
+        "output.foxglove.json",
         "output.mcap",
         "report.html",
         "strip.png",
@@ -106,7 +107,7 @@ def test_compare_runs_the_base_on_the_same_frames(recording: Path, tmp_path: Pat
 
 
 def test_scores_are_those_of_the_depth_in_the_output(recording: Path, tmp_path: Path) -> None:
-    run(recording, tmp_path / "out")
+    run(recording, tmp_path / "out", "--write", "raw")
     errors, predictions, truths = [], [], []
     for message, frame in zip(
         output(tmp_path / "out")["/stream_depth/depth/image"], rgbd(5), strict=True
@@ -126,11 +127,12 @@ def test_scores_are_those_of_the_depth_in_the_output(recording: Path, tmp_path: 
 
 
 def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: Path) -> None:
-    run(recording, tmp_path / "out")
+    run(recording, tmp_path / "out", "--write", "raw")
     read = output(tmp_path / "out")
     assert {topic: len(found) for topic, found in read.items()} == {
         "/camera/image/compressed": 5,
         "/camera/camera_info": 5,
+        "/camera/ground_truth/image": 5,
         "/stream_depth/depth/image": 5,
         "/stream_depth/depth/camera_info": 5,
         "/stream_depth/points": 5,
@@ -157,7 +159,7 @@ def test_the_output_recording_is_what_foxglove_needs(recording: Path, tmp_path: 
     with (tmp_path / "out" / "output.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None and summary.statistics is not None
-    assert summary.statistics.message_count == 45
+    assert summary.statistics.message_count == 50
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
     assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
     assert "float64 data" in next(

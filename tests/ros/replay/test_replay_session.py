@@ -32,7 +32,7 @@ FIXED = ("--metric-source", "fixed", "--metric-scale", "2.5")
 
 
 def run(recording: Path, out: Path, *options: str) -> int:
-    fixed = ["--out", str(out), "--model", "tiny", "--threads", "1", "--write", "mcap"]
+    fixed = ["--out", str(out), "--model", "tiny", "--threads", "1", "--write", "raw"]
     return main([str(recording), *fixed, *options], load_tiny)
 
 

@@ -128,7 +128,7 @@ class Session:
     def replay(self, messages: list[Message], *more: str) -> tuple[list[bytes], dict[str, Any]]:
         """dyfn-replay's depth of every image, and its metrics.json."""
         recording, out = record(self.folder / "sent.mcap", self.info, messages), self.folder / "out"
-        command = [str(recording), "--out", str(out), "--write", "mcap", "--device", "cpu"]
+        command = [str(recording), "--out", str(out), "--write", "raw", "--device", "cpu"]
         command += ["--threads", "1", "--depth-topic", "none", *more]
         for name, value in {"model": "tiny", "scene_cut_threshold": 0.0, **self.options}.items():
             command += [f"--{name.replace('_', '-')}", str(value)]
