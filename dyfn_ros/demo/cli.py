@@ -122,6 +122,7 @@ def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[st
     parameters = {
         "model": options.model,
         "drop_frames": False,
+        "reliability": "reliable",  # from the first frame on
         "wait_for_camera_info": first.info is not None,
         "image_transport": "compressed" if first.source.kind == COMPRESSED_IMAGE else "raw",
     }
