@@ -209,6 +209,11 @@ class Prediction(Generic[ArrayT]):
         depth = self.depth if self.unit == 1.0 else self.depth / self.unit
         return depth, known & (depth > 0) & (depth < math.inf)
 
+    @property
+    def steady(self) -> bool:
+        """Whether depth and mask are as `aligned_quantity` has them: one unit, nothing withheld."""
+        return self.unit == 1.0 and self.withheld is None
+
     def numpy(self) -> Prediction[np.ndarray]:
         """The same with numpy arrays in place of tensors.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dyfn_core.geometry.camera import check_camera_matrix
+from dyfn_core.geometry.rigid import size_of
 from dyfn_core.geometry.tracks import TrackerState, TrackOptions, Tracks, track
 from dyfn_core.geometry.triangulation import Triangulated, Views, triangulate
 
@@ -227,9 +228,7 @@ def step_variance(relative: np.ndarray) -> tuple[float, float]:
     Returns:
         Variance of the rotation (rad^2) and of the translation (m^2), per axis.
     """
-    cosine = (np.trace(relative[:3, :3]) - 1) / 2
-    angle = math.acos(min(max(float(cosine), -1.0), 1.0))
-    distance = float(np.linalg.norm(relative[:3, 3]))
+    angle, distance = size_of(relative)
     rotation = _TURN[0] ** 2 + (_TURN[1] * angle) ** 2
     translation = _STEP[0] ** 2 + (_STEP[1] * distance) ** 2
     return rotation, translation

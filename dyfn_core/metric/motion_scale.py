@@ -151,10 +151,14 @@ class MotionScale:
     measured: ScaleMeasurement | None
     problem: str
 
+    @property
+    def factor(self) -> np.ndarray:
+        """H x W float32: units of the locked one in a unit of the prediction."""
+        return np.asarray(np.exp(self.field + np.float32(self.log_scale)))
+
     def relative(self, depth: np.ndarray) -> np.ndarray:
         """H x W float32: predicted depth in the locked unit."""
-        factor = np.exp(self.field + np.float32(self.log_scale))
-        return np.asarray(depth * factor, np.float32)
+        return np.asarray(depth * self.factor, np.float32)
 
     def metres(self, depth: np.ndarray) -> np.ndarray | None:
         """H x W float32: predicted depth in metres; None while `metric` is."""

@@ -13,11 +13,11 @@ from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibration
 from dyfn_core.metric.ground import up_from_pitch
 from dyfn_core.metric.pairing import Pairing
 from dyfn_core.metric.references import Reference
-from dyfn_core.metric.scale import MetricScale, ScaleInForce, ScaleOptions, to_metres
+from dyfn_core.metric.scale import MetricScale, ScaleOptions, to_metres
 from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.options import StreamOptions
 from dyfn_core.stream.resets import ANOTHER_CLOCK
-from dyfn_core.stream.stages import StreamStage
+from dyfn_core.stream.scale_stage import ScaleStage
 
 
 def scale_options(options: StreamOptions) -> ScaleOptions:
@@ -43,7 +43,7 @@ def scale_options(options: StreamOptions) -> ScaleOptions:
     )
 
 
-class MetricStage(StreamStage):
+class MetricStage(ScaleStage):
     """Metres from a fixed scale, from measurements, or from the camera's height.
 
     While a source is configured and has no scale yet, depth is withheld (all invalid) unless
@@ -53,11 +53,11 @@ class MetricStage(StreamStage):
     saved_as = "calibration"
 
     def __init__(self, options: Callable[[], StreamOptions]) -> None:
-        """options: Asked for at each frame; only the live ones may change."""
-        self._options = options
+        """options: See ScaleStage."""
+        super().__init__(options)
         self._metric = MetricScale(scale_options(options()))
         self._pairing: Pairing[Reference] = Pairing(options().reference_tolerance)
-        self.scale: ScaleInForce = self._metric.in_force(0.0)  # at the last frame
+        self.scale = self._metric.in_force(0.0)  # at the last frame
 
     @property
     def metres_per_unit(self) -> float | None:
@@ -81,7 +81,7 @@ class MetricStage(StreamStage):
 
     def started(self, reason: str | None) -> None:
         """A new stream has a unit of its own: calibrations end or are kept as less certain."""
-        self._metric.reset(self._options().after_reset == "keep")
+        self._metric.reset(self._keeps)
         if reason in ANOTHER_CLOCK:
             self._pairing.clear()
 
@@ -104,18 +104,7 @@ class MetricStage(StreamStage):
         mask = prediction.mask & before
         return replace(prediction, points=points, depth=depth, mask=mask, metric=True)
 
-    def problems(self) -> list[str]:
-        """See StreamStage."""
-        return [f"scale: {self.scale.warning}"] if self.scale.warning else []
-
     @property
     def unused(self) -> Counter[str]:
         """How many measurements, or points of them, were not used, by reason."""
         return self._pairing.dropped + self._metric.calibrator.dropped
-
-    def report(self) -> dict[str, str]:
-        """See StreamStage."""
-        values = {f"scale: {key}": value for key, value in self.scale.described().items()}
-        unused = sorted(self.unused.items())
-        values.update({f"scale: not used, {reason}": str(n) for reason, n in unused})
-        return values

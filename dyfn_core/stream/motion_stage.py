@@ -21,30 +21,26 @@ from dyfn_core.metric.references import Reference
 from dyfn_core.metric.scale import ScaleInForce
 from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.options import StreamOptions
-from dyfn_core.stream.stages import StreamStage
+from dyfn_core.stream.scale_stage import ScaleStage
 
 _LATELY = 3.0  # seconds that a problem of the odometry is a user's business for
 
 
-class MotionStage(StreamStage):
+class MotionStage(ScaleStage):
     """Depth in one locked unit, and its metres, by metric_source "odometry".
 
     Each frame's scale, and the smooth field that mends its shape, come from points that are
     triangulated with the frames' poses (dyfn_core.metric.motion_scale). The unit is locked at the
     first measurement and the output goes on without a jump; metres follow when the odometry has
     agreed with the pictures for some seconds. Until then `until_metric` says what goes out.
-
-    Attributes:
-        scale: What the depth of the last frame means.
-        unused: Frames that gave no points, by what was wrong with the odometry.
     """
 
     saved_as = "motion"
-    source = "odometry"
+    source = called = "odometry"
 
     def __init__(self, options: Callable[[], StreamOptions]) -> None:
-        """options: Asked for at each frame; only the live ones may change."""
-        self._options = options
+        """options: See ScaleStage."""
+        super().__init__(options)
         self._how = MotionScaleOptions()
         if not options().scale_field:
             self._how = replace(self._how, field=None)
@@ -52,13 +48,18 @@ class MotionStage(StreamStage):
         self._last_problem: tuple[float, str] = (-math.inf, "")
         self._kept = ""
         self.scale = ScaleInForce(self.source, problem="no measurement yet")
-        self.unused: Counter[str] = Counter()
+        self._unused: Counter[str] = Counter()
 
     @property
     def metres_per_unit(self) -> float | None:
         """Metres in the locked unit; None before it is locked."""
         unit = self._state.unit
         return None if unit is None else math.exp(unit)
+
+    @property
+    def unused(self) -> Counter[str]:
+        """See ScaleStage: frames that gave no points, by what was wrong with the odometry."""
+        return self._unused
 
     @property
     def state(self) -> MotionScaleState:
@@ -72,12 +73,11 @@ class MotionStage(StreamStage):
     def add_reference(self, stamp: float, reference: Reference) -> None:
         """A measurement of another kind: counted, not used."""
         del stamp, reference
-        self.unused[f"a reference, but metric_source is {self.source}"] += 1
+        self._unused[f"a reference, but metric_source is {self.source}"] += 1
 
     def started(self, reason: str | None) -> None:
         """A new stream has a unit of its own; what is known of the metres may be kept."""
-        keep = self._options().after_reset == "keep"
-        self._state = self._state.restarted(self._how) if keep else MotionScaleState()
+        self._state = self._state.restarted(self._how) if self._keeps else MotionScaleState()
         self._last_problem = (-math.inf, "")
         known = self._state.scale is not None
         self._kept = f"kept from before a reset ({reason})" if known and reason else ""
@@ -94,15 +94,15 @@ class MotionStage(StreamStage):
             raise ValueError(f"metric_source {self.source!r} needs the frame's stamp, got None")
         if frame.camera_matrix is None:
             self.scale = replace(self.scale, map=None, problem="the camera matrix is unknown")
-            self.unused[self.scale.problem] += 1
+            self._unused[self.scale.problem] += 1
             return self._without_metres(prediction)
         self._state, found = step(self._state, self._frame(frame, prediction), self._how)
         if found.measured is not None:
             self._kept = ""
         self.scale = self._described(frame.stamp, found)
         if found.points.problem:
-            self.unused[_kind(found.points.problem)] += 1
-        factor = np.exp(found.field + np.float32(found.log_scale))
+            self._unused[_kind(found.points.problem)] += 1
+        factor = found.factor
         steady = replace(
             prediction,
             depth=prediction.depth * factor,
@@ -151,17 +151,6 @@ class MotionStage(StreamStage):
             problem=problem or self._kept,
             kept=bool(self._kept),
         )
-
-    def problems(self) -> list[str]:
-        """See StreamStage."""
-        return [f"odometry: {self.scale.warning}"] if self.scale.warning else []
-
-    def report(self) -> dict[str, str]:
-        """See StreamStage."""
-        values = {f"scale: {key}": value for key, value in self.scale.described().items()}
-        unused = sorted(self.unused.items())
-        values.update({f"scale: not used, {reason}": str(n) for reason, n in unused})
-        return values
 
 
 def _kind(problem: str) -> str:

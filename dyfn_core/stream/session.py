@@ -23,6 +23,7 @@ from dyfn_core.stream.resets import (
     REQUESTED,
 )
 from dyfn_core.stream.saving import Loaded, StateKeeper, StreamSettings
+from dyfn_core.stream.scale_stage import ScaleStage
 from dyfn_core.stream.scene_cut_stage import SceneCutStage
 from dyfn_core.stream.stages import StreamStage
 
@@ -95,7 +96,7 @@ class StreamSession:
                 "whose unknown shift no metric scale undoes; expected 'none'"
             )
         by_motion = options.metric_source == MotionStage.source
-        metric = MotionStage if by_motion else MetricStage
+        metric: type[ScaleStage] = MotionStage if by_motion else MetricStage
         self._metric = metric(lambda: self._options)
         cuts = SceneCutStage(lambda: self._options.scene_cut_threshold)
         self.stages: tuple[StreamStage, ...] = (cuts, self._metric, *stages)

@@ -141,7 +141,7 @@ def _evaluate(
             one.stamp,
             one.latency,
             one.prediction.metric,
-            one.prediction.aligned_quantity,
+            None if one.prediction.steady else one.prediction.aligned_quantity,
         )
         write(one.frame, one.prediction, score)
     for loss, count in runner.losses().items():

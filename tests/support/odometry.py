@@ -24,6 +24,8 @@ from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 from dyfn_ros.recordings.typestore import quaternion_from_matrix
 
 SECOND = 1_000_000_000
+CAMERA = "camera_optical"
+TIMES = np.arange(0, 2, 0.05)  # seconds of a drive
 # Optical axes (right, down, forward) of a camera that looks ahead, 0.3 m before the base's centre,
 # 0.5 m above it, turned 30 degrees to the left and tilted down by 10.
 _LEFT = quaternion_rotation(np.cos(np.radians(15)), 0, 0, np.sin(np.radians(15)))

@@ -22,8 +22,10 @@ from dyfn_ros.messages.camera_poses import (
 from dyfn_ros.messages.odometry_options import OdometryOptions
 from dyfn_ros.messages.transforms import TransformBuffer
 from tests.support.odometry import (
+    CAMERA,
     MOUNT,
     SECOND,
+    TIMES,
     base_pose,
     camera_pose,
     odometry,
@@ -34,8 +36,6 @@ from tests.support.odometry import (
     transform,
 )
 
-CAMERA = "camera_optical"
-TIMES = np.arange(0, 2, 0.05)
 BY_PARAMETER = pose_text(MOUNT)
 
 

@@ -14,8 +14,10 @@ from dyfn_ros.recordings.poses import PoseError, PoseTopic, open_poses
 from dyfn_ros.recordings.typestore import TF
 from dyfn_ros.recordings.writer import RecordingWriter
 from tests.support.odometry import (
+    CAMERA,
     MOUNT,
     SECOND,
+    TIMES,
     base_pose,
     camera_pose,
     odometry,
@@ -25,9 +27,7 @@ from tests.support.odometry import (
     transform,
 )
 
-CAMERA = "camera_optical"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
-TIMES = np.arange(0, 2, 0.05)
 
 
 def record(
