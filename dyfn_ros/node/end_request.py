@@ -39,7 +39,7 @@ class EndRequest:
         return self._asked.is_set()
 
     def open(self) -> None:
-        """From now on the owner looks at `asked`, and calls `leave`."""
+        """From now on the owner looks at `asked`, and ends."""
         with self._lock:
             self._opened = True
 
@@ -49,7 +49,7 @@ class EndRequest:
             self._wake = wake
 
     def leave(self, code: int) -> NoReturn:
-        """End the process, whatever its threads do: there may be a model that is still loading."""
+        """End the process at once, whatever its threads do; the middleware cleans nothing up."""
         with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
             sys.stdout.flush()
             sys.stderr.flush()

@@ -28,8 +28,8 @@ def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> 
         code = run(sys.argv if args is None else list(args), load, end)
     except Exception:
         traceback.print_exc()
-        code = 1
-    end.leave(code)
+        end.leave(1)
+    sys.exit(code)  # the middleware frees its shared memory as the interpreter ends
 
 
 if __name__ == "__main__":

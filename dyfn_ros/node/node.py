@@ -65,6 +65,7 @@ class StreamDepthNode(LifecycleNode):
         self._callback_errors = 0
         self._device = ""
         self._worker: FrameWorker[FrameJob] | None = None
+        self._abandoned: list[FrameWorker[FrameJob]] = []  # that did not end in time
         self._cameras: list[Camera] = []
         self._made: list[Callable[[], Any]] = []  # what cleanup undoes
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
@@ -184,6 +185,7 @@ class StreamDepthNode(LifecycleNode):
         """Undo configure. patience: seconds for the frame that is being worked on."""
         self._set_active(False)
         if self._worker is not None and not self._worker.stop(patience):
+            self._abandoned.append(self._worker)
             for camera in self._cameras:
                 camera.abandoned = True
         if self._phase in ("inactive", "active"):
@@ -354,7 +356,8 @@ class StreamDepthNode(LifecycleNode):
             )
         return lines
 
-    def close(self) -> None:
-        """Say what became of the frames, and release everything."""
+    def close(self) -> bool:
+        """Say what became of the frames, and release everything. -> whether no thread is left."""
         self._release_all(_LAST_PATIENCE)
         self.destroy_node()
+        return all(worker.stop(0.0) for worker in self._abandoned)

@@ -33,10 +33,13 @@ def run(args: Sequence[str], load: ModelLoader | None, end: EndRequest) -> int:
         print(f"stream_depth: {error}", file=sys.stderr)
         return 0 if end.asked() else 1
     try:
-        return _serve(node, end)
+        code = _serve(node, end)
     finally:
-        node.close()
+        done = node.close()
         try_shutdown()
+    if not done:  # a model that is still loading: the interpreter cannot end under its thread
+        end.leave(code)
+    return code
 
 
 def _serve(node: StreamDepthNode, end: EndRequest) -> int:
@@ -48,7 +51,10 @@ def _serve(node: StreamDepthNode, end: EndRequest) -> int:
         return 1
     executor = NodeExecutor(node, end.asked, node.callback_failed)
     end.wake_with(executor.wake)
-    executor.spin()
+    try:
+        executor.spin()
+    finally:
+        executor.shutdown()
     return 0
 
 
