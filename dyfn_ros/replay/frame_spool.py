@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -44,8 +46,8 @@ class SmallFrame:
     base: tuple[np.ndarray, np.ndarray] | None = None
 
 
-class _Arrays:
-    """Tuples of arrays in a file without a name in `folder`, which goes away with the process."""
+class _Pickles:
+    """Values in a file without a name in `folder`, which goes away with the process."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -55,24 +57,22 @@ class _Arrays:
     def close(self) -> None:
         self._file.close()
 
-    def push(self, *arrays: np.ndarray) -> None:
+    def push(self, value: object) -> None:
         try:
             self._file.seek(0, os.SEEK_END)
-            for array in arrays:
-                np.save(self._file, array, allow_pickle=False)
+            pickle.dump(value, self._file, pickle.HIGHEST_PROTOCOL)
             self._file.flush()
         except OSError as error:
             raise cannot_write(self._folder / "(copies of frames)", error) from error
         self.count += 1
 
-    def read(self, size: int) -> Iterator[tuple[np.ndarray, ...]]:
-        """Every tuple of this many arrays, in order."""
+    def __iter__(self) -> Iterator[Any]:
         place = 0
         for _ in range(self.count):
             self._file.seek(place)
-            arrays = tuple(np.load(self._file) for _ in range(size))
+            value = pickle.load(self._file)
             place = self._file.tell()
-            yield arrays
+            yield value
 
 
 class FrameSpool:
@@ -83,19 +83,19 @@ class FrameSpool:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._arrays, self._base = _Arrays(folder), _Arrays(folder)
+        self._frames, self._base = _Pickles(folder), _Pickles(folder)
 
     def __enter__(self) -> FrameSpool:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._arrays.close()
+        self._frames.close()
         self._base.close()
 
     @property
     def frames(self) -> int:
         """How many frames it holds."""
-        return self._arrays.count
+        return self._frames.count
 
     @property
     def has_base(self) -> bool:
@@ -106,35 +106,15 @@ class FrameSpool:
         self, frame: RecordedFrame, prediction: Prediction[np.ndarray], pose: np.ndarray | None
     ) -> None:
         """Keep a frame, small."""
-        small = shrink(frame, prediction, pose)
-        missing = np.empty(0)
-        self._arrays.push(
-            np.array(small.stamp_ns),
-            small.image,
-            small.predicted,
-            small.solid,
-            missing if small.truth is None else small.truth,
-            small.matrix,
-            missing if small.pose is None else small.pose,
-        )
+        self._frames.push(shrink(frame, prediction, pose))
 
     def push_base(self, prediction: Prediction[np.ndarray]) -> None:
         """Keep what the base model predicts of the next frame, small."""
-        self._base.push(*_small_depth(prediction))
+        self._base.push(_small_depth(prediction))
 
     def __iter__(self) -> Iterator[SmallFrame]:
-        frames = zip_longest(self._arrays.read(7), self._base.read(2))
-        for (stamp, image, predicted, solid, truth, matrix, pose), base in frames:
-            yield SmallFrame(
-                int(stamp),
-                image,
-                predicted,
-                solid,
-                truth if truth.size else None,
-                matrix,
-                pose if pose.size else None,
-                None if base is None else (base[0], base[1]),
-            )
+        for frame, base in zip_longest(self._frames, self._base):
+            yield replace(frame, base=base)
 
 
 def shrink(

@@ -8,8 +8,8 @@ import sys
 import threading
 from typing import TYPE_CHECKING
 
+from dyfn_ros.node.end_request import SIGNALS
 from dyfn_ros.node.main import main
-from tests.support.odometry import use_tf_stand_in
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -51,5 +51,9 @@ def die_with_parent() -> None:
 
 if __name__ == "__main__":
     die_with_parent()
+    # As EndRequest does, which must be there before the threads that numpy starts.
+    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    from tests.support.odometry import use_tf_stand_in
+
     use_tf_stand_in()
     main(load=load)

@@ -133,7 +133,7 @@ def test_images_that_are_lost_on_the_way_are_a_warning_with_advice(start: Start)
     known(probe, publisher)
 
     def told() -> bool:
-        for _ in range(5):
+        for _ in range(40):
             publisher.publish(stamped(image_message(LARGE), time.time_ns()))
         text, values = camera(probe)
         lost = int(values["lost on the way"])
