@@ -43,6 +43,11 @@ def finite_above_zero(text: str) -> float:
     return _parsed(text, float, lambda value: 0 < value < math.inf, "a finite number above 0")
 
 
+def finite(text: str) -> float:
+    """A number that is not infinite."""
+    return _parsed(text, float, math.isfinite, "a finite number")
+
+
 def device_name(text: str) -> str:
     """A name that models.resolve_device may know; whether it is here shows when it is used."""
     if not re.fullmatch(r"auto|cpu|(cuda|mps|xpu)(:\d+)?", text):

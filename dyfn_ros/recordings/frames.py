@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -60,5 +60,8 @@ class Recording(Protocol):
     def expected_frames(self) -> int:
         """How many images the recording says it has."""
 
-    def frames(self) -> Iterator[RecordedFrame]:
+    def frames(self) -> Generator[RecordedFrame, None, None]:
         """Every frame in log-time order, always the same for the same recording."""
+
+    def doubts(self) -> list[str]:
+        """What makes the pairs of images and depth implausible; complete after frames()."""

@@ -7,14 +7,14 @@ from typing import Literal
 
 from dyfn_core.data.rgbd.layouts import FolderOptions
 from dyfn_core.prediction import DEPTH
-from dyfn_ros.messages.references import parse_pose
+from dyfn_ros.messages.references import Transform, parse_pose
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame, Recording
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording, is_rgbd_folder
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.ros import BagRecording
-from dyfn_ros.recordings.storage.open import open_storage
-from dyfn_ros.recordings.topics import choose_topics
+from dyfn_ros.recordings.storage.open import Storage, open_storage
+from dyfn_ros.recordings.topics import Topics, choose_topics
 from dyfn_ros.recordings.topics import image_topics as list_image_topics
 from dyfn_ros.recordings.typestore import POINT_CLOUD
 from dyfn_ros.recordings.writer import RecordingWriter
@@ -44,6 +44,7 @@ def open_recording(
     stamps: Literal["header", "log"] = "header",
     quantity: str = DEPTH,
     depth_scale: float | None = None,
+    depth_offset: float = 0.0,
 ) -> Recording:
     """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, or an RGB-D folder.
 
@@ -53,7 +54,8 @@ def open_recording(
     the image's optical frame; None: at its optical centre. tolerance: seconds between the stamps
     of an image and its ground truth. stamps: "header", or "log" for the time of recording.
     quantity: what the depth topic's images hold, see GroundTruth. depth_scale: stored depth values
-    per metre; None: as the encoding or the folder's layout says.
+    per metre; None: as the encoding or the folder's layout says. depth_offset: seconds by which
+    the depth's stamps are after those of images of the same moment, which is taken away.
     Raises RecordingError: not a recording, nothing readable, no image topic, or several
     candidates, which are then listed with their types; ValueError for wrong options.
     """
@@ -62,23 +64,35 @@ def open_recording(
         raise ValueError(f"stamps is {stamps!r}, expected 'header' or 'log'")
     transform = parse_pose(depth_transform, "depth_transform") if depth_transform else None
     if path.is_dir() and is_rgbd_folder(path):
-        return RgbdRecording(path, FolderOptions(depth_scale=depth_scale))
+        return RgbdRecording(
+            path, FolderOptions(depth_scale=depth_scale, depth_offset=depth_offset)
+        )
     storage = open_storage(path)
     topics = choose_topics(
         path, storage, image_topic, camera_info_topic, depth_topic, depth_info_topic
     )
-    if transform is not None and topics.depth_info is None and topics.depth is not None:
-        kind = storage.topics[topics.depth].kind
-        if kind != POINT_CLOUD:
-            raise RecordingError(
-                f"{path}: a depth transform needs the CameraInfo of {topics.depth}; name it with "
-                "--depth-info-topic"
-            )
-    if quantity != DEPTH and topics.depth and storage.topics[topics.depth].kind == POINT_CLOUD:
+    _check_depth(path, storage, topics, transform, quantity)
+    return BagRecording(
+        path, storage, topics, tolerance, transform, stamps, quantity, depth_scale, depth_offset
+    )
+
+
+def _check_depth(
+    path: Path, storage: Storage, topics: Topics, transform: Transform | None, quantity: str
+) -> None:
+    """Refuse what the depth topic is asked for and cannot be."""
+    if topics.depth is None:
+        return
+    kind = storage.topics[topics.depth].kind
+    if transform is not None and topics.depth_info is None and kind != POINT_CLOUD:
+        raise RecordingError(
+            f"{path}: a depth transform needs the CameraInfo of {topics.depth}; name it with "
+            "--depth-info-topic"
+        )
+    if quantity != DEPTH and kind == POINT_CLOUD:
         raise RecordingError(
             f"{path}: {topics.depth} is {POINT_CLOUD}, expected images of {quantity}"
         )
-    return BagRecording(path, storage, topics, tolerance, transform, stamps, quantity, depth_scale)
 
 
 def image_topics(path: str | Path) -> list[str | None]:

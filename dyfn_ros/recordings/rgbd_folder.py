@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,11 @@ class RgbdRecording:
         """See Recording."""
         return len(self._folder.frames)
 
-    def frames(self) -> Iterator[RecordedFrame]:
+    def doubts(self) -> list[str]:
+        """See Recording; files have no time of recording."""
+        return []
+
+    def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
         frame_id = "camera_optical"
         self.notes = Notes(warnings=self._warnings.copy())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +15,7 @@ from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_image
 from dyfn_ros.messages.rectify import LensError, PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
+from dyfn_ros.recordings.clocks import StampedTimes, clock_offset, offset_text, side_of
 from dyfn_ros.recordings.depth_matching import Match, Stamped, match_depth
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
@@ -37,6 +38,7 @@ class BagRecording:
         stamps: Literal["header", "log"] = "header",
         quantity: str = DEPTH,
         depth_scale: float | None = None,
+        depth_offset: float = 0.0,
     ) -> None:
         self.path = path
         self.topics = topics
@@ -46,15 +48,18 @@ class BagRecording:
         self._tolerance_ns = round(tolerance * 1e9)
         self._truth = GroundTruth(transform, self._assumed, quantity, depth_scale)
         self._log_time = stamps == "log"
+        self._depth_offset_ns = round(depth_offset * 1e9)
+        self._known_losses = list(storage.losses)  # whatever of the recording is read
         self._matched = 0  # images with a depth
         self._offsets: list[int] = []  # of the nearest depth beyond the tolerance, ns
+        self._image_times, self._depth_times = StampedTimes(), StampedTimes()
 
     @property
     def expected_frames(self) -> int:
         """See Recording."""
         return self._storage.topics[self.topics.image].count
 
-    def frames(self) -> Iterator[RecordedFrame]:
+    def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
         self.notes = Notes()
         self.notes.warnings.update(topic_remarks(self._storage, self.topics))
@@ -63,33 +68,62 @@ class BagRecording:
         depth_infos = _Infos(self._first(self.topics.depth_info), self._assumed)
         calibrator = Rectifier(self._unusable)
         index = 0
-        for match in self._matches():
-            infos.recorded = match.image.info or infos.recorded
-            if match.depth is not None:
-                depth_infos.recorded = match.depth.info or depth_infos.recorded
-            frame = self._decode(index, match, infos, depth_infos, calibrator)
-            if frame is not None:
-                index += 1
-                yield frame
-        self._note_offset()
-        self.notes.losses.update(self._storage.losses)
+        try:
+            for match in self._matches():
+                infos.recorded = match.image.info or infos.recorded
+                if match.depth is not None:
+                    depth_infos.recorded = match.depth.info or depth_infos.recorded
+                frame = self._decode(index, match, infos, depth_infos, calibrator)
+                if frame is not None:
+                    index += 1
+                    yield frame
+        finally:  # also when no more frames are wanted
+            lost = [*self._known_losses, *self._storage.losses]
+            self.notes.losses.update(dict.fromkeys(lost, 1))
+
+    def doubts(self) -> list[str]:
+        """See Recording."""
+        if self.topics.depth is None or self._log_time:
+            return []
+        tolerance = self._tolerance_ns * 1e-9
+        images = self._image_times
+        apart = 2 * self._matched < len(images)
+        found = clock_offset(images, self._depth_times, self._tolerance_ns, apart)
+        if found is not None and found.drifts:
+            start, end = (
+                f"{offset_text(abs(value), tolerance)} s {side_of(value)}"
+                for value in (found.start, found.end)
+            )
+            return [
+                f"{self.topics.depth}: its stamps are {start} those of the images recorded with "
+                f"them at first and {end} at last: one clock drifts; --stamps log takes the time "
+                "of recording"
+            ]
+        if found is not None:
+            return [self._doubted_offset(found.seconds, "images recorded at the same time")]
+        if self._offsets and self._matched == 0:
+            nearest = float(np.median(self._offsets)) * 1e-9
+            return [self._doubted_offset(nearest, "the images nearest to them")]
+        return []
+
+    def _doubted_offset(self, seconds: float, what: str) -> str:
+        tolerance = self._tolerance_ns * 1e-9
+        there = self._depth_offset_ns * 1e-9
+        mend = offset_text(there + seconds, tolerance)
+        corrected = f", less --depth-offset {there:g}," if there else ""
+        return (
+            f"{self.topics.depth}: its stamps{corrected} are "
+            f"{offset_text(abs(seconds), tolerance)} s {side_of(seconds)} those of {what} (median, "
+            f"--tolerance {tolerance:g}); if they are of another clock, --depth-offset {mend} "
+            "takes that away, and --stamps log takes the time of recording"
+        )
 
     def _matches(self) -> Iterator[Match]:
         self._matched, self._offsets = 0, []
+        self._image_times, self._depth_times = StampedTimes(), StampedTimes()
         if self.topics.depth is None:
             return (Match(image) for image in self._events())
         return match_depth(self._events(), self.topics.depth, self._tolerance_ns)
-
-    def _note_offset(self) -> None:
-        """Say how far the nearest depths are away when no image has one."""
-        if self._offsets and self._matched == 0:
-            offset = float(np.median(self._offsets)) * 1e-9
-            side = "after" if offset > 0 else "before"
-            self.notes.warnings[
-                f"{self.topics.depth}: the nearest depth is {abs(offset):.3f} s {side} the image "
-                f"(median), beyond --tolerance {self._tolerance_ns * 1e-9:g}; --stamps log takes "
-                "the time of recording"
-            ] = 1
 
     def _first(self, topic: str | None) -> Recorded | None:
         return next(iter(self._storage.messages([topic] if topic else [])), None)
@@ -114,9 +148,12 @@ class BagRecording:
         except RecordingError as error:
             self.notes.losses[str(error)] += 1
             return None
-        if self._log_time:
-            return Stamped(recorded.log_ns, recorded)
-        return Stamped(stamp.sec * 1_000_000_000 + stamp.nanosec, recorded)
+        is_depth, log_ns = recorded.topic == self.topics.depth, recorded.log_ns
+        stamp_ns = log_ns if self._log_time else stamp.sec * 1_000_000_000 + stamp.nanosec
+        if is_depth:
+            stamp_ns -= self._depth_offset_ns
+        (self._depth_times if is_depth else self._image_times).add(stamp_ns, log_ns)
+        return Stamped(stamp_ns, recorded)
 
     def _unusable(self, reason: str) -> None:
         """Noted once, however many frames it is in force for."""

@@ -155,6 +155,7 @@ def _write_pictures(
                 continue
             frames.append((frame.index, frame.stamp_ns, camera))
         problems += recording.notes.losses + _other_warnings(recording.notes.warnings)
+        problems.update(recording.doubts())
         meta = {"recording": str(root), "frames": frames, "problems": problems}
         (partial_folder / "meta.json").write_text(json.dumps(meta))
         if folder.exists():  # another process was faster

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.argument_types import above_zero, at_least_one, finite_above_zero
+from dyfn_core.argument_types import above_zero, at_least_one, finite, finite_above_zero
 from dyfn_core.cli.arguments import (
     Options,
     add_controls,
@@ -208,6 +208,14 @@ def _add_source(group: Options) -> None:
         metavar="X",
         help="stored depth values per metre (default: 1000 for 16UC1, 1 for 32FC1 and clouds, of a "
         "folder by its layout)",
+    )
+    add(
+        "--depth-offset",
+        type=finite,
+        default=0.0,
+        metavar="SECONDS",
+        help="how much the depth's stamps are after those of images of the same moment, negative "
+        "for before (default: 0)",
     )
     add(
         "--tolerance",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -82,6 +83,7 @@ class SourceReader:
             stamps=source.stamps,
             quantity=quantity,
             depth_scale=source.depth_scale,
+            depth_offset=source.depth_offset,
         )
         available = math.ceil(self.recording.expected_frames / source.stride)
         self.expected = min(available, source.max_frames or available)
@@ -91,10 +93,12 @@ class SourceReader:
     def frames(self) -> Iterator[RecordedFrame]:
         """Every frame asked for, in the recording's order."""
         self._plausibility = Plausibility(self.expected, self._remedies)
-        frames = islice(self.recording.frames(), 0, None, self._source.stride)
-        for frame in islice(frames, self._source.max_frames):
-            self._plausibility.push(frame.image, frame.depth, frame.stamp_ns, frame.camera_matrix)
-            yield frame
+        with closing(self.recording.frames()) as every:
+            strided = islice(every, 0, None, self._source.stride)
+            for frame in islice(strided, self._source.max_frames):
+                stamp, camera = frame.stamp_ns, frame.camera_matrix
+                self._plausibility.push(frame.image, frame.depth, stamp, camera)
+                yield frame
 
     def doubts(self, scored: int) -> list[str]:
         """What makes the scores of the frames implausible, a sentence each.
@@ -103,7 +107,7 @@ class SourceReader:
             scored: How many of the frames were scored.
         """
         expected = None if self.recording.topics.depth is None else scored
-        return self._plausibility.warnings(expected)
+        return [*self.recording.doubts(), *self._plausibility.warnings(expected)]
 
     def references(self, options: SessionOptions) -> ReferenceFeed | None:
         """The measurements of the reference topic, from the first on.

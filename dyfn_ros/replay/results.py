@@ -107,6 +107,7 @@ def _metrics(
             "tolerance": source.tolerance,
             "depth_transform": source.depth_transform,
             "depth_scale": source.depth_scale,
+            "depth_offset": source.depth_offset or None,
             "depth_max": None if math.isinf(outputs.depth_max) else outputs.depth_max,
             **result.options,
         },

@@ -44,6 +44,7 @@ class Source:
         depth_topic: Ground truth; None: found by type, "none": no scores.
         depth_info_topic: CameraInfo of a depth camera that is not the image's.
         depth_scale: Stored depth values per metre; None: as the encoding or the layout says.
+        depth_offset: Seconds that the depth's stamps are after those of the images.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
         odometry_topic: Poses for metric_source "odometry", see recordings.poses.PoseTopic.
@@ -61,6 +62,7 @@ class Source:
     depth_info_topic: str | None = None
     depth_transform: str | None = None
     depth_scale: float | None = None
+    depth_offset: float = 0.0
     reference_topic: str | None = None
     odometry_topic: str | None = None
     odometry_noise: OdometryNoise | None = None

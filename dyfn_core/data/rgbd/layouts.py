@@ -51,11 +51,13 @@ class FolderOptions:
         intrinsics: fx, fy, cx, cy in pixels of the colour image.
         depth_scale: stored depth values per metre.
         tolerance: seconds between a colour frame and its depth, in folders with stamps.
+        depth_offset: seconds that the stamps of depth.txt are after those of rgb.txt.
     """
 
     intrinsics: Camera | None = None
     depth_scale: float | None = None
     tolerance: float = TOLERANCE
+    depth_offset: float = 0.0
 
     def calibration(self, file: Path, published: FolderCamera | None = None) -> Calibration:
         """Of a folder whose own is in this file."""
@@ -107,8 +109,14 @@ def open_folder(path: Path, report: DataReport, options: FolderOptions | None = 
     layout = layout_of(path)
     if layout is None:
         raise DataError(f"{path}: expected {EXPECTED}")
+    options = options or FolderOptions()
+    if options.depth_offset and layout != TUM:
+        raise DataError(
+            f"{path}: an offset of depth in time ({options.depth_offset:g} s) needs stamps of its "
+            "own for depth, in rgb.txt and depth.txt"
+        )
     try:
-        opened = _OPENERS[layout](path, report, options or FolderOptions())
+        opened = _OPENERS[layout](path, report, options)
     except FrameError as error:
         raise DataError(str(error)) from error
     if not opened.frames:
@@ -163,7 +171,7 @@ def _tum(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder
     depths = stamped_files(folder / "depth.txt", report) if has_depth else []
     files = []
     for number, (stamp, image) in enumerate(colours):
-        depth = nearest(depths, stamp, options.tolerance)
+        depth = nearest(depths, stamp + options.depth_offset, options.tolerance)
         if depth is None and has_depth:
             report.miss(f"image without depth within {options.tolerance} s", image)
         files.append(FrameFiles(number, image, depth, stamp=stamp))

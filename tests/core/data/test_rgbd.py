@@ -149,6 +149,26 @@ def test_lists_say_what_belongs_together_and_when(tmp_path: Path, bom: bool) -> 
     assert list(report.problems) == ["folder without groundtruth.txt (its frames have no poses)"]
 
 
+def test_an_offset_between_the_lists_is_taken_away(tmp_path: Path) -> None:
+    names = [f"{i}.png" for i in range(COUNT)]
+    write_folder(tmp_path, names, names, unit=5000)
+    lists = {
+        kind: [f"{t + late:.6f} {kind}/{name}" for t, name in zip(STAMPS, names, strict=True)]
+        for kind, late in (("rgb", 0.0), ("depth", -41.25))
+    }
+    write_lists(tmp_path, lists)
+    folder = open_folder(tmp_path, DataReport("test"), FolderOptions(depth_offset=-41.25))
+    check(folder)
+    report = DataReport("test")
+    assert not open_folder(tmp_path, report).with_depth
+    assert report.problems["image without depth within 0.02 s"] == [
+        str(tmp_path / "rgb" / name) for name in names
+    ]
+    (tmp_path / "rgb.txt").unlink()
+    with pytest.raises(DataError, match="an offset of depth in time"):
+        open_folder(tmp_path, report, FolderOptions(depth_offset=-41.25))
+
+
 @pytest.mark.parametrize("depth_first", [False, True])
 @pytest.mark.parametrize("name", ["associations", "associate"])
 def test_associations_alone(tmp_path: Path, depth_first: bool, name: str) -> None:

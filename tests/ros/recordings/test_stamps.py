@@ -1,7 +1,9 @@
 """Images and depth whose stamps do not tell them apart: never a wrong pair."""
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from dyfn_ros.recordings.open import open_recording
@@ -34,9 +36,9 @@ def write(
 
         def put(topic: str, index: int, log_ns: int) -> None:
             image = (
-                image_message(picture(index), "rgb8", image_stamps[index], "camera")
+                image_of(index, image_stamps[index])
                 if topic == "/image"
-                else image_message(depth(index), "32FC1", depth_stamps[index], "camera")
+                else depth_of(index, depth_stamps[index])
             )
             if topic == "/image" or index != missing:
                 writer.write(topic, IMAGE, image, log_ns)
@@ -108,13 +110,88 @@ def test_the_same_message_twice_is_one(tmp_path: Path, depth_first: bool) -> Non
     assert AMBIGUOUS not in recording.notes.warnings
 
 
-@pytest.mark.parametrize(("part", "words"), [(0.4, "after"), (-0.4, "before")])
-def test_a_constant_offset_is_named(tmp_path: Path, part: float, words: str) -> None:
-    shifted = [SECOND + stamp + round(part * STEP) for stamp in EXACT]
-    write(tmp_path / "bag", [SECOND + stamp for stamp in EXACT], shifted)
+def shifted(seconds: float, stamps: list[int] = EXACT) -> list[int]:
+    return [2 * SECOND + stamp + round(seconds * SECOND) for stamp in stamps]
+
+
+@pytest.mark.parametrize(
+    ("offset", "told"),
+    [
+        (0.04, "0.04 s after"),  # less than half a period, and no image has depth
+        (-0.04, "0.04 s before"),
+        (0.35, "0.35 s after"),  # the nearest depths are 0.05 s away
+        (-0.35, "0.35 s before"),
+        (0.1, "0.1 s after"),  # each image has the depth of another one
+        (-0.1, "0.1 s before"),
+        (3.51, "3.51 s after"),
+        (1.7e9, "1700000000 s after"),  # time since start against time since 1970
+    ],
+)
+@pytest.mark.parametrize("depth_first", [False, True])
+def test_a_constant_offset_is_named_and_mended_by_the_option(
+    tmp_path: Path, offset: float, told: str, depth_first: bool
+) -> None:
+    write(tmp_path / "bag", shifted(0), shifted(offset), depth_first=depth_first)
     recording = open_recording(tmp_path / "bag")
-    assert numbers(recording.frames()) == [None] * COUNT
-    (text,) = (text for text in recording.notes.warnings if "nearest" in text)
-    assert f"0.040 s {words} the image (median), beyond --tolerance 0.02;" in text
-    assert "--stamps log" in text
-    assert numbers(open_recording(tmp_path / "bag", stamps="log").frames()) == [*range(COUNT)]
+    found = numbers(recording.frames())
+    assert [i for i, n in enumerate(found) if i == n] == []
+    (text,) = recording.doubts()
+    assert text.startswith(f"/depth: its stamps are {told} those of ")
+    named = float(text.partition("--depth-offset ")[2].split()[0])
+    assert named == offset and "--stamps log" in text
+
+    mended = open_recording(tmp_path / "bag", depth_offset=named)
+    assert numbers(mended.frames()) == [*range(COUNT)] and mended.doubts() == []
+    by_log = open_recording(tmp_path / "bag", stamps="log")
+    assert numbers(by_log.frames()) == [*range(COUNT)] and by_log.doubts() == []
+    wrong = open_recording(tmp_path / "bag", depth_offset=named + 0.2)
+    assert numbers(wrong.frames()) != [*range(COUNT)]
+    (text,) = wrong.doubts()
+    assert f"less --depth-offset {named + 0.2:g}, are 0.2 s before" in text
+    assert f"--depth-offset {told.split()[0] if offset > 0 else offset:} takes" in text
+
+
+@pytest.mark.parametrize(
+    ("factor", "first", "last"), [(1.25, "0.025", "0.25"), (1.05, "0.005", "0.05")]
+)
+def test_a_clock_that_drifts_is_named(tmp_path: Path, factor: float, first: str, last: str) -> None:
+    drifting = [2 * SECOND + round(factor * stamp) for stamp in EXACT]
+    write(tmp_path / "bag", shifted(0), drifting)
+    recording = open_recording(tmp_path / "bag")
+    assert numbers(recording.frames()) != [*range(COUNT)]
+    (text,) = recording.doubts()
+    assert text == (
+        f"/depth: its stamps are {first} s after those of the images recorded with them at first "
+        f"and {last} s after at last: one clock drifts; --stamps log takes the time of recording"
+    )
+    by_log = open_recording(tmp_path / "bag", stamps="log")
+    assert numbers(by_log.frames()) == [*range(COUNT)] and by_log.doubts() == []
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_depth_that_is_recorded_late_with_the_stamps_of_its_images_is_right(
+    tmp_path: Path, late: int
+) -> None:
+    """Its delay is more than a period; the stamps, which are not regular, belong together."""
+    uneven = [
+        2 * SECOND + stamp + int(noise)
+        for stamp, noise in zip(
+            EXACT, np.random.default_rng(1).integers(0, 1_000_000, COUNT), strict=True
+        )
+    ]
+    with RecordingWriter(tmp_path / "bag") as writer:
+        put = [("/image", image_of, 0.01), ("/depth", depth_of, 0.01 + late * 0.12)]
+        for topic, maker, delay in put:
+            for index, at in enumerate(uneven):
+                writer.write(topic, IMAGE, maker(index, at), at + round(delay * SECOND))
+    recording = open_recording(tmp_path / "bag")
+    assert numbers(recording.frames()) == [*range(COUNT)]
+    assert recording.doubts() == [] and not recording.notes.warnings
+
+
+def image_of(index: int, at: int) -> Any:
+    return image_message(picture(index), "rgb8", at, "camera")
+
+
+def depth_of(index: int, at: int) -> Any:
+    return image_message(depth(index), "32FC1", at, "camera")

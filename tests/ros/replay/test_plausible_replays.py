@@ -33,6 +33,7 @@ def write(
     depth: Depth = right,
     *,
     stamp: Callable[[int], int] = lambda i: i * SECOND // 10,
+    late: int = 0,
     matrix: np.ndarray = MATRIX,
 ) -> Path:
     with RecordingWriter(path) as writer:
@@ -45,7 +46,8 @@ def write(
             truth = depth(index)
             if truth is not None:
                 encoding = "16UC1" if truth.dtype == np.uint16 else "32FC1"
-                writer.write("/depth", IMAGE, image_message(truth, encoding, at, "camera"), log)
+                message = image_message(truth, encoding, at + late, "camera")
+                writer.write("/depth", IMAGE, message, log)
     return path
 
 
@@ -63,6 +65,22 @@ def test_a_right_recording_is_not_doubted(
     assert (code, metrics["warnings"], metrics["recording"]["warnings"]) == (ALL, [], {})
     assert "implausible" not in capsys.readouterr().err
     assert "Implausible" not in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_stamps_of_another_clock_are_named_and_the_option_mends_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write(tmp_path / "bag", late=SECOND // 5)  # each depth at another image's stamp
+    code, metrics = run(recording, "--strict")
+    text, other = metrics["warnings"]
+    assert code == PARTIAL and text.startswith("/depth: its stamps are 0.2 s after")
+    assert other.startswith("the ground truth does not correlate")
+    assert capsys.readouterr().err.count(text) == 1
+    code, mended = run(recording, "--strict", "--depth-offset", "0.2")
+    assert (code, mended["warnings"], mended["options"]["depth_offset"]) == (ALL, [], 0.2)
+    _, true = run(write(tmp_path / "true"), "--strict")
+    assert mended["image"] == true["image"] != metrics["image"]
+    assert true["options"]["depth_offset"] is None
 
 
 def millimetres(index: int) -> np.ndarray:
