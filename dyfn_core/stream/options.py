@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
+from dyfn_core.stream.picture_check import CONTRAST, FROZEN_AFTER
 from dyfn_core.stream.resets import TimeRules
 from dyfn_core.stream.scene_cut import THRESHOLD
 
@@ -102,6 +103,22 @@ class StreamOptions:
         "Difference between consecutive images beyond which the camera is somewhere else and the "
         "stream resets; 0 switches it off. See docs/metric_scale.md.",
         range=(0.0, 2.0),
+        live=True,
+    )
+    blank_contrast: float = option(
+        STREAM,
+        CONTRAST,
+        "Grey levels of structure below which a picture shows nothing (covered lens, flash, "
+        "darkness): no pixel of its depth is valid; 0 switches it off.",
+        range=(0.0, 128.0),
+        live=True,
+    )
+    frozen_after: float = option(
+        STREAM,
+        FROZEN_AFTER,
+        "Seconds of pictures with the same bytes, at least 10 of them, after which the camera is "
+        "frozen and no depth valid; 0 switches it off (a simulator without noise, standing still).",
+        range=(0.0, 3600.0),
         live=True,
     )
     state_file: str = option(

@@ -15,6 +15,7 @@ from dyfn_core.stream.depth_stream import DepthStream, same_camera
 from dyfn_core.stream.metric_stage import MetricStage
 from dyfn_core.stream.motion_stage import MotionStage
 from dyfn_core.stream.options import StreamOptions, options_of
+from dyfn_core.stream.picture_stage import PictureStage
 from dyfn_core.stream.resets import (
     FAILED,
     NEW_CAMERA,
@@ -47,15 +48,17 @@ class StreamSession:
     A frame passes, in this order: a state that was loaded takes the stream's place; the rules
     decide whether the stream must be reset (a failed frame, a request, another frame_id, stamps,
     image size, camera matrix, settings, then the stages: scene cuts); the network and DyFN; the
-    stages again, in their order: metres, and what the caller adds. The first rule that applies
-    gives the reason of a reset. A reset ends the memory of the stream and of its stages.
+    stages again, in their order: pictures that show nothing, metres, and what the caller adds.
+    The first rule that applies gives the reason of a reset. A reset ends the memory of the stream
+    and of its stages.
 
     One thread pushes frames and sets `options`. `add_reference`, `request_reset`, `save`, `load`,
-    `report` and `problems` may be called by others.
+    `report`, `problems` and `faults` may be called by others.
 
     Attributes:
         model: The network, shared by any number of sessions.
-        stages: Scene cuts, metric scale, and those that were given, in this order.
+        stages: Scene cuts, unusable pictures, metric scale, and those that were given, in this
+            order.
         resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
         stream: What holds the memory; None before the first frame and after a failed one.
 
@@ -82,7 +85,7 @@ class StreamSession:
         Args:
             model: The network.
             options: None for the defaults.
-            stages: Of the caller's own; they come after scene cuts and metric scale.
+            stages: Of the caller's own; they come after those of the session.
 
         Raises:
             ValueError: An option that is not allowed, or metres of a model that predicts
@@ -99,7 +102,8 @@ class StreamSession:
         metric: type[ScaleStage] = MotionStage if by_motion else MetricStage
         self._metric = metric(lambda: self._options)
         cuts = SceneCutStage(lambda: self._options.scene_cut_threshold)
-        self.stages: tuple[StreamStage, ...] = (cuts, self._metric, *stages)
+        self._pictures = PictureStage(lambda: self._options)
+        self.stages: tuple[StreamStage, ...] = (cuts, self._pictures, self._metric, *stages)
         self.resets: Counter[str] = Counter()
         self.stream: DepthStream | None = None
         self.asked = ResetRequest()
@@ -138,6 +142,11 @@ class StreamSession:
         """Of the unit that the whole stream keeps; None before its metres are known, see
         Prediction.unit."""
         return self._metric.metres_per_unit
+
+    @property
+    def unusable_pictures(self) -> Counter[str]:
+        """How many pictures gave no depth, by reason: a covered lens, a frozen camera."""
+        return self._pictures.unusable
 
     # Any thread.
 
@@ -223,6 +232,14 @@ class StreamSession:
             One line a problem; empty when there is none.
         """
         return [problem for stage in self.stages for problem in stage.problems()]
+
+    def faults(self) -> list[str]:
+        """Why the last frame has no depth at all, though the stream runs.
+
+        Returns:
+            One line a fault; empty when there is none.
+        """
+        return [fault for stage in self.stages for fault in stage.faults()]
 
     # The thread that pushes frames.
 
@@ -325,8 +342,8 @@ class StreamSession:
         self.stream.resets = self.resets
         self._settings = loaded.settings
         for stage in self.stages:
-            if stage.saved_as:
-                stage.restore(getattr(loaded.saved, stage.saved_as))
+            saved = stage.saved_as
+            stage.restore(getattr(loaded.saved, saved) if saved else None)
 
     def _reason(self, frame: Frame, asked: ResetRequest) -> str | None:
         """The first rule, those of the stages apart, by which this frame resets the stream."""

@@ -52,3 +52,7 @@ class StreamStage:
     def problems(self) -> list[str]:
         """For diagnostics, any thread: what a user should look at."""
         return []
+
+    def faults(self) -> list[str]:
+        """For diagnostics, any thread: why the last frame has no depth at all."""
+        return []

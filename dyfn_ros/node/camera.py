@@ -79,6 +79,7 @@ class Camera:
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
         self._info: CameraInfo | None = None
+        self._faults: list[str] = []
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
         self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings())
@@ -234,8 +235,20 @@ class Camera:
         session, until = self._opened(), job.arrived + self.settings.odometry_wait
         frame = self.odometry.placed(frame, job.message.header, until)
         found = session.end(frame, prediction)
-        self.scale_topics.publish(session.scale)
+        faults = session.faults()
+        self._tell(faults)
+        self.scale_topics.publish(session.scale, faults)
         return found
+
+    def _tell(self, faults: list[str]) -> None:
+        """A line in the log when frames stop having depth, and when they have it again."""
+        if faults != self._faults:
+            text = "; ".join(faults)
+            if text:
+                self._error(f"{self.image_topic}: {text}; no depth while it lasts")
+            else:
+                self._warn(f"{self.image_topic}: the pictures show a scene again")
+        self._faults = faults
 
     def publish(
         self, job: FrameJob, frame: Frame, info: CameraInfo | None, found: Prediction[np.ndarray]

@@ -124,6 +124,7 @@ def _camera_problems(
     if not snapshot.same_clock:
         problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
     if camera.session is not None:
+        problems += [(ERROR, f"{text}; no depth") for text in camera.session.faults()]
         problems += [(WARN, text) for text in camera.session.problems()]
     problems += [(WARN, text) for text in camera.odometry.problems()]
     return problems

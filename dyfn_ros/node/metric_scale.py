@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import sensor_msgs.msg
@@ -65,14 +65,21 @@ class ScaleTopics:
 
         self._take = take
 
-    def publish(self, scale: ScaleInForce) -> None:
-        """Both are latched and follow every frame: a number to plot, and all that is known."""
-        self._scale.publish(Float64(data=scale.map.scale if scale.map else math.nan))
+    def publish(self, scale: ScaleInForce, faults: Sequence[str]) -> None:
+        """Both are latched and follow every frame: a number to plot, and all that is known.
+
+        faults: why the frame has no depth at all; there are no metres then either.
+        """
+        known = scale.map.scale if scale.map and not faults else math.nan
+        self._scale.publish(Float64(data=known))
+        level = DiagnosticStatus.WARN if scale.warning else DiagnosticStatus.OK
         self._status.publish(
             DiagnosticStatus(
-                level=DiagnosticStatus.WARN if scale.warning else DiagnosticStatus.OK,
+                level=DiagnosticStatus.ERROR if faults else level,
                 name=f"{self._title}: scale",
-                message=scale.warning or ("metric" if scale.metric else "relative"),
+                message="; ".join(faults)
+                or scale.warning
+                or ("metric" if scale.metric else "relative"),
                 values=[KeyValue(key=k, value=v) for k, v in scale.described().items()],
             )
         )

@@ -122,7 +122,7 @@ def _write_rows(path: Path, evaluation: SequenceEvaluation) -> None:
 
 
 def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
-    recording = metrics["recording"]
+    recording, blind = metrics["recording"], metrics.get("pictures_without_depth", {})
     facts: list[list[str | float | int | None]] = [
         ["recording", recording["path"]],
         ["frames", metrics["frames"]],
@@ -132,6 +132,7 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
         ["output SHA-256", metrics["output_sha256"][:16]],
         *([topic, value] for topic, value in recording["topics"].items()),
         *([f"resets, {reason}", count] for reason, count in metrics.get("resets", {}).items()),
+        *([f"pictures without depth, {why}", count] for why, count in blind.items()),
         *([f"metric scale, {k}", v] for k, v in metrics.get("metric_scale", {}).items()),
         *([f"state {what}", text] for what, text in metrics.get("state", {}).items()),
         *([name, value] for name, value in metrics["options"].items() if value is not None),

@@ -109,6 +109,8 @@ class StreamRunner:
     def facts(self) -> dict[str, Any]:
         """What metrics.json has of the session: resets, metric scale, saved state."""
         found: dict[str, Any] = {"resets": dict(self._session.resets)}
+        if unusable := self._session.unusable_pictures:
+            found["pictures_without_depth"] = dict(unusable)
         if self._run.stream.metric_source != "none":
             found["metric_scale"] = self._session.scale.described()
         if self._poses is not None and (facts := self._poses.facts()):
@@ -118,6 +120,8 @@ class StreamRunner:
     def warnings(self) -> dict[str, int]:
         """What a user should look at, with how often."""
         found = dict.fromkeys(self._session.problems(), 1)
+        for reason, count in sorted(self._session.unusable_pictures.items()):
+            found[f"pictures without depth: {reason}"] = count
         if self._poses is not None:
             found |= self._poses.warnings()
             for reason, count in sorted(self._session.unused_references.items()):

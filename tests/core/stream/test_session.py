@@ -30,11 +30,12 @@ from dyfn_core.stream.stages import StreamStage
 from tests.support.tiny_model import FAILING, load_tiny
 
 IMAGE = np.full((24, 32, 3), 90, np.uint8)
+ANY_PICTURE = {"scene_cut_threshold": 0.0, "blank_contrast": 0.0}
 MATRIX = np.array([[30.0, 0, 15.5], [0, 30, 11.5], [0, 0, 1]])
 
 
 def session_of(**options: Any) -> StreamSession:
-    return StreamSession(load_tiny(), StreamOptions(**{"scene_cut_threshold": 0.0, **options}))
+    return StreamSession(load_tiny(), StreamOptions(**{**ANY_PICTURE, **options}))
 
 
 def seen(

@@ -91,6 +91,7 @@ def test_the_camera_s_height_over_a_floor_gives_metres() -> None:
     options = StreamOptions(
         metric_source="camera_height",
         camera_height=1.5,
+        blank_contrast=0.0,  # a floor and nothing on it
         calibration_points=2,
         calibration_seconds=0.01,
     )

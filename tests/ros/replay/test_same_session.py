@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 
 from dyfn_core.geometry.rigid import between, inverse
 from dyfn_core.models.base import GeometryModel
+from dyfn_core.stream.picture_check import BLANK, FROZEN
 from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.recordings.typestore import IMAGE, TF, TYPES
 from dyfn_ros.recordings.writer import RecordingWriter
@@ -244,6 +245,7 @@ def test_the_camera_height(session: Callable[..., Session]) -> None:
         camera_height=1.5,
         calibration_points=2,
         calibration_seconds=2.0,
+        blank_contrast=0.0,  # a floor and nothing on it
     )
     height, width = 48, 64
     focal = width / 2 / np.tan(np.radians(FOV_X / 2))
@@ -260,6 +262,22 @@ def test_the_camera_height(session: Callable[..., Session]) -> None:
     offline, metrics = bench.replay(sent)
     assert live == offline and finite(offline[-1])
     assert float(metrics["metric_scale"]["scale"]) == pytest.approx(3.0, rel=0.1)
+
+
+def test_a_covered_lens_and_a_frozen_camera(session: Callable[..., Session]) -> None:
+    bench = session(metric_source="fixed", metric_scale=2.0, max_gap=0.0)
+    black = np.zeros_like(frames(1)[0])
+    one, other = frames(2, seed=9)
+    pictures = [one, black, black, *[other] * 11, one]
+    sent = images(list(range(10, 10 + len(pictures))), pictures)
+    live = bench.live(sent)
+    offline, metrics = bench.replay(sent)
+    assert live == offline
+    nothing = [index for index, depth in enumerate(live) if not finite(depth)]
+    assert nothing == [1, 2, 12, 13]
+    assert metrics["pictures_without_depth"] == {BLANK: 2, FROZEN: 2}
+    warned = metrics["recording"]["warnings"]
+    assert warned[f"pictures without depth: {BLANK}"] == 2
 
 
 def plane_walk(bench: Session, count: int) -> tuple[list[Message], list[Message]]:
