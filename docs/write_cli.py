@@ -14,6 +14,7 @@ from textwrap import fill
 from dyfn_core.cli import eval as dyfn_eval
 from dyfn_core.cli import train as dyfn_train
 from dyfn_ros.demo import cli as dyfn_demo
+from dyfn_ros.depth import options as dyfn_depth
 from dyfn_ros.record import cli as dyfn_record
 from dyfn_ros.replay import options as dyfn_replay
 from dyfn_worlds import cli as dyfn_worlds
@@ -34,6 +35,7 @@ A wrong value ends a command with exit code 2 and one line on stderr. The node's
 def parsers() -> list[argparse.ArgumentParser]:
     """The parsers of all commands but the node's, which takes ROS arguments."""
     return [
+        dyfn_depth.parser(),
         dyfn_replay.parser(),
         dyfn_record.parser(),
         dyfn_demo.parser(),

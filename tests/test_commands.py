@@ -14,6 +14,8 @@ from dyfn_core.cli import eval as dyfn_eval
 from dyfn_core.cli import train as dyfn_train
 from dyfn_core.cli.arguments import command_parser, renamed
 from dyfn_ros.demo import cli as dyfn_demo
+from dyfn_ros.depth import cli as dyfn_depth
+from dyfn_ros.depth import options as depth_options
 from dyfn_ros.record import cli as dyfn_record
 from dyfn_ros.replay import cli as dyfn_replay
 from dyfn_ros.replay import options as replay_options
@@ -24,6 +26,7 @@ from dyfn_worlds import cli as dyfn_worlds
 WRITER = Path(__file__).parents[1] / "docs/write_cli.py"
 Main = Callable[[Sequence[str]], int]
 MAINS: dict[str, Main] = {
+    "dyfn-depth": dyfn_depth.main,
     "dyfn-replay": dyfn_replay.main,
     "dyfn-record": dyfn_record.main,
     "dyfn-demo": dyfn_demo.main,
@@ -32,6 +35,7 @@ MAINS: dict[str, Main] = {
     "dyfn-worlds": dyfn_worlds.main,
 }
 PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
+    "dyfn-depth": depth_options.parser,
     "dyfn-replay": replay_options.parser,
     "dyfn-record": dyfn_record.parser,
     "dyfn-demo": dyfn_demo.parser,
@@ -43,6 +47,14 @@ EVAL = ["run", "--benchmark", "sintel", "--model", "dyfn-mini", "--data", ".", "
 WORLDS = ["--assets", ".", "--out", "o"]
 # A command line, and what its one line on stderr says.
 NONSENSE = [
+    ("dyfn-depth no_such_file.mp4", "no_such_file.mp4 does not exist; expected a picture"),
+    ("dyfn-depth 0 --fov 180", "--fov: expected degrees between 0 and 180, got '180'"),
+    ("dyfn-depth 0 --fov 60 --camera-matrix 1 1 1 1", "both give the focal length"),
+    ("dyfn-depth 0 --near 3 --far 2", "--near 3 --far 2: expected near below far"),
+    ("dyfn-depth 0 --capture-size 640", "--capture-size: expected WIDTHxHEIGHT"),
+    ("dyfn-depth 0 --write mp4", "--write: unknown output 'mp4', expected some of video"),
+    ("dyfn-depth 0 --metric-source camera_height", "needs --camera-height METRES"),
+    ("dyfn-depth 0 --metric-source odometry", "--metric-source"),
     ("dyfn-replay walk --out o --stride 0", "--stride: expected a whole number of 1 or more"),
     ("dyfn-replay walk --out o --max-frames many", "--max-frames"),
     ("dyfn-replay walk --out o --device tpu", "--device: expected auto, cpu, cuda or cuda:N"),

@@ -15,11 +15,12 @@ import numpy as np
 
 from dyfn_core.argument_types import finite_above_zero
 from dyfn_core.cli.arguments import add_max_frames, add_out, add_stride, command_parser
-from dyfn_ros.record.camera_yaml import read_camera_yaml
-from dyfn_ros.record.sources import folder_frames, video_frames
+from dyfn_ros.record.sources import folder_frames
+from dyfn_ros.recordings.camera_yaml import read_camera_yaml
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_writer import ColourEncoding, FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.typestore import Lens
+from dyfn_ros.recordings.video_file import video_frames
 from dyfn_ros.recordings.writer import STORAGES, DepthEncoding
 
 ALL, UNUSABLE, PARTIAL = 0, 2, 3  # exit codes, as dyfn-replay's

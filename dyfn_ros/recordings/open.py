@@ -10,6 +10,7 @@ from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.references import Transform, parse_pose
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame, Recording
+from dyfn_ros.recordings.image_recording import ImageRecording, is_image_recording
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording, is_rgbd_folder
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.ros import BagRecording
@@ -46,7 +47,8 @@ def open_recording(
     depth_scale: float | None = None,
     depth_offset: float = 0.0,
 ) -> Recording:
-    """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, or an RGB-D folder.
+    """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, an RGB-D folder, a video file or a
+    folder of pictures.
 
     A topic that is None is found by type when there is one candidate; "none" means to do without
     (camera info, depth). depth_info_topic: CameraInfo of a depth camera that is not the image's.
@@ -67,6 +69,8 @@ def open_recording(
         return RgbdRecording(
             path, FolderOptions(depth_scale=depth_scale, depth_offset=depth_offset)
         )
+    if is_image_recording(path):
+        return ImageRecording(path)
     storage = open_storage(path)
     topics = choose_topics(
         path, storage, image_topic, camera_info_topic, depth_topic, depth_info_topic
@@ -96,11 +100,12 @@ def _check_depth(
 
 
 def image_topics(path: str | Path) -> list[str | None]:
-    """Every colour image topic of a recording, for open_recording; of an RGB-D folder [None].
+    """Every colour image topic of a recording, for open_recording; [None] of what has
+    no topics.
 
     Raises RecordingError as open_recording does, but for several candidates.
     """
     path = Path(path)
-    if path.is_dir() and is_rgbd_folder(path):
+    if (path.is_dir() and is_rgbd_folder(path)) or is_image_recording(path):
         return [None]
     return [*list_image_topics(path, open_storage(path))]

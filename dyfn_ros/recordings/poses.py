@@ -17,6 +17,7 @@ from dyfn_ros.messages.camera_poses import CameraPoses
 from dyfn_ros.messages.odometry_options import KINDS, ODOMETRY, TF, OdometryOptions
 from dyfn_ros.messages.transforms import TransformBuffer, TransformError
 from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.image_recording import is_image_recording
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_poses
 from dyfn_ros.recordings.storage.base import Recorded, Storage
 from dyfn_ros.recordings.storage.open import open_storage
@@ -56,6 +57,8 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
         if not poses:
             raise PoseError(f"{path} holds no poses.txt or groundtruth.txt of its frames")
         return lambda index, stamp_ns: poses.get(stamp_ns)
+    if is_image_recording(path):
+        raise PoseError(f"{path} holds pictures, and no pose or odometry topic")
     storage = open_storage(path)
     kinds = _kinds(storage)
     transforms = TransformBuffer(_EVERYTHING)

@@ -167,30 +167,34 @@ class RgbdRecording:
 
     def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
-        frame_id = "camera_optical"
         self.notes = Notes(warnings=self._warnings.copy())
 
         def lose(reason: str) -> None:
             self.notes.losses[reason] += 1
 
         for index, frame in enumerate(rgbd_frames(self._folder, lose)):
-            stamp_ns = frame.stamp_ns
-            image = image_message(frame.image, "rgb8", stamp_ns, frame_id)
-            info = None
-            if frame.camera_matrix is not None:
-                size = frame.image.shape[:2]
-                message = camera_info(frame.camera_matrix, size, stamp_ns, frame_id)
-                info = _made("/camera/camera_info", CAMERA_INFO, message, stamp_ns)
-            yield RecordedFrame(
-                index=index,
-                stamp_ns=stamp_ns,
-                frame_id=frame_id,
-                image=frame.image,
-                camera_matrix=frame.camera_matrix,
-                depth=frame.depth_m,
-                source=_made("/camera/image", IMAGE, image, stamp_ns),
-                info=info,
-            )
+            yield as_recorded(index, frame)
+
+
+def as_recorded(index: int, frame: FrameToRecord) -> RecordedFrame:
+    """A frame as a recording gives it, with messages made of it."""
+    stamp_ns, frame_id = frame.stamp_ns, "camera_optical"
+    image = image_message(frame.image, "rgb8", stamp_ns, frame_id)
+    info = None
+    if frame.camera_matrix is not None:
+        size = frame.image.shape[:2]
+        message = camera_info(frame.camera_matrix, size, stamp_ns, frame_id)
+        info = _made("/camera/camera_info", CAMERA_INFO, message, stamp_ns)
+    return RecordedFrame(
+        index=index,
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        image=frame.image,
+        camera_matrix=frame.camera_matrix,
+        depth=frame.depth_m,
+        source=_made("/camera/image", IMAGE, image, stamp_ns),
+        info=info,
+    )
 
 
 def _made(topic: str, kind: str, message: Any, stamp_ns: int) -> Recorded:

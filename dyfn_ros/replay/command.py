@@ -6,6 +6,7 @@ import sys
 
 from dyfn_core.evaluation.report.html import text_table
 from dyfn_core.evaluation.sequence import score_table
+from dyfn_ros.recordings.image_recording import is_image_recording
 from dyfn_ros.replay.batch import expand, is_many, replay_all
 from dyfn_ros.replay.jobs import EXPECTED_ERRORS, PARTIAL, UNUSABLE, code_of, run_job, split
 from dyfn_ros.replay.options import Command
@@ -64,6 +65,9 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
     for text in metrics.get("state", {}).values():
         print(f"state: {text}")
     print(text_table(score_table(results_by_name(metrics))))
+    if is_image_recording(job.source.recording):
+        told = f"for depth as video or files: dyfn-depth {job.source.recording}"
+        print(f"it has no ground truth, so nothing is scored; {told}")
     written = [name for name in dict.fromkeys(FILES.values()) if (folder / name).exists()]
     listed = ", ".join(["report.html", "metrics.json", "frames.csv", *written])
     print(f"results in {folder}: {listed}")

@@ -217,7 +217,7 @@ def _compact(cloud: np.ndarray, head: Any) -> Any:
 
 def cloud_message(frame: RecordedFrame, prediction: Prediction[np.ndarray]) -> Any:
     """A PointCloud2 of every s-th point, s the smallest that gives at most MAX_POINTS."""
-    cloud = pack_cloud(*subsampled(frame, prediction))
+    cloud = pack_cloud(*subsampled(frame.image, prediction))
     head = header(frame.stamp_ns, frame.frame_id)
     return _cloud(head, cloud.shape, CLOUD_OFFSETS, CLOUD_STEP, cloud, dense=False)
 
@@ -248,11 +248,11 @@ def _cloud(
 
 
 def subsampled(
-    frame: RecordedFrame, prediction: Prediction[np.ndarray]
+    image: np.ndarray, prediction: Prediction[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points, validity and colours of every s-th row and column, at most MAX_POINTS."""
     grid = sample_grid(prediction.depth.shape, MAX_POINTS)
-    return prediction.points[grid], prediction.valid[grid], frame.image[grid]
+    return prediction.points[grid], prediction.valid[grid], image[grid]
 
 
 def score_values(prediction: Prediction[np.ndarray], score: FrameScore) -> dict[str, float]:

@@ -149,8 +149,8 @@ def parser() -> argparse.ArgumentParser:
         type=Path,
         nargs="+",
         metavar="recording",
-        help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder; several, a folder of them, "
-        "or a .txt file that lists them",
+        help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder, video, folder of pictures; "
+        "several, a folder of them, or a .txt file that lists them",
     )
     _add_source(made.add_argument_group("source", "what is read of a recording"))
     stream = add_options(made, SessionOptions, without=("stabilize", "num_tokens"))[STREAM]

@@ -15,6 +15,7 @@ from dyfn_core.scoring.plausibility import Plausibility, Remedies
 from dyfn_ros.messages.references import message_references
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame
+from dyfn_ros.recordings.image_recording import ImageRecording
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.reference_topic import ReferenceTopic
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording
@@ -125,10 +126,10 @@ class SourceReader:
         source = self._source
         if options.metric_source != "reference":
             return None
-        if isinstance(self.recording, RgbdRecording):
+        if isinstance(self.recording, (RgbdRecording, ImageRecording)):
             raise RecordingError(
                 f"{source.recording}: metric_source is 'reference', expected a recording with a "
-                f"topic of {options.reference_type}; an RGB-D folder has none"
+                f"topic of {options.reference_type}; an RGB-D folder or a video has none"
             )
         kind = f"sensor_msgs/msg/{options.reference_type}"
         topic = ReferenceTopic(source.recording, source.reference_topic, kind, source.stamps)
@@ -154,6 +155,11 @@ class SourceReader:
         """
         if options.metric_source != "odometry":
             return None
+        if isinstance(self.recording, ImageRecording):
+            raise RecordingError(
+                f"{self._source.recording}: metric_source is 'odometry', expected a recording "
+                "with poses; a video or a folder of pictures has none"
+            )
         return PoseFeed(self._source, options)
 
     def warn(self, reason: str, times: int = 1) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -11,13 +10,11 @@ import numpy as np
 
 from dyfn_core.evaluation.report.frame_grid import depth_bar, draw_bars, error_bar
 from dyfn_core.evaluation.report.pictures import colour_depth, colour_error, depth_range
-from dyfn_core.files import OutputError, finished_file
 from dyfn_ros.replay.frame_spool import FrameSpool, SmallFrame
+from dyfn_ros.replay.mp4 import Mp4File, load_av
 from dyfn_ros.replay.scale_curve import ScaleCurve
 from dyfn_ros.replay.shown_run import ShownRun
 
-CODEC = "libx264"
-TICKS = 1000  # of a second; the time base
 BAR = 24  # pixels for the captions
 RANGE_FRAMES = 32  # frames that the range of colours is of
 USUAL_STEP, LONGEST_STEP = 0.1, 1.0  # seconds a frame is shown when stamps go back, and at most
@@ -34,32 +31,11 @@ def write_video(path: Path, spool: FrameSpool, runs: Sequence[ShownRun]) -> None
         spool: The frames.
         runs: The run, and the base model's where the spool has it.
     """
-    try:
-        import av  # loads ffmpeg's libraries: not for --help
-    except ImportError as error:
-        raise OutputError(
-            f"--write video needs PyAV ({error}): install this package with its `video` extra"
-        ) from error
-
+    load_av()
     panels = _Panels(spool, runs)
-    with (
-        finished_file(path) as partial,
-        av.open(str(partial), "w", "mp4", options={"movflags": "faststart"}) as container,
-    ):
-        stream = None
+    with Mp4File(path) as video:
         for number, (time, frame) in enumerate(_timed(spool)):
-            picture = panels.draw(number, frame)
-            if stream is None:
-                stream = container.add_stream(CODEC, options={"crf": "20", "preset": "veryfast"})
-                stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt = "yuv420p"
-                stream.codec_context.time_base = stream.time_base = Fraction(1, TICKS)
-                stream.codec_context.thread_count = 1
-            image = av.VideoFrame.from_ndarray(_fit(picture, stream.height, stream.width))
-            image.pts, image.time_base = round(time * TICKS), Fraction(1, TICKS)
-            container.mux(stream.encode(image))
-        if stream is not None:
-            container.mux(stream.encode())
+            video.write(panels.draw(number, frame), time)
 
 
 def _timed(spool: FrameSpool) -> Iterator[tuple[float, SmallFrame]]:
@@ -68,17 +44,9 @@ def _timed(spool: FrameSpool) -> Iterator[tuple[float, SmallFrame]]:
     for frame in spool:
         if last is not None:
             step = (frame.stamp_ns - last) / 1e9
-            # Two frames may not share a tick.
-            time += min(max(step, 2 / TICKS), LONGEST_STEP) if step > 0 else USUAL_STEP
+            time += min(step, LONGEST_STEP) if step > 0 else USUAL_STEP
         last = frame.stamp_ns
         yield time, frame
-
-
-def _fit(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """A frame of another size than the first is scaled to it."""
-    if picture.shape[:2] != (height, width):
-        picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(picture)
 
 
 class _Panels:
@@ -124,7 +92,7 @@ class _Panels:
         ]
 
     def draw(self, number: int, frame: SmallFrame) -> np.ndarray:
-        """Rows and columns x 3 uint8 RGB, both even as yuv420p asks for.
+        """Rows x columns x 3 uint8 RGB.
 
         Above: input, truth, base, result; below, with truth: the scale so far, and the errors.
         """
@@ -142,9 +110,7 @@ class _Panels:
         above |= {name: self._paint(depth) for name, depth in ordered.items()}
         rows = [np.hstack([_captioned(name, panel) for name, panel in above.items()])]
         rows += [np.hstack(below)] if below else []
-        drawn = np.vstack([*rows, draw_bars(self._bars, rows[0].shape[1])])
-        odd = drawn.shape[0] % 2, drawn.shape[1] % 2
-        return np.pad(drawn, ((0, odd[0]), (0, odd[1]), (0, 0)))
+        return np.vstack([*rows, draw_bars(self._bars, rows[0].shape[1])])
 
     def _paint(self, depth: np.ndarray) -> np.ndarray:
         return colour_depth(depth, self._near, self._far)

@@ -35,6 +35,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "recordings": {"messages"},
         "replay": {"recordings", "messages"},
         "record": {"recordings", "messages"},
+        "depth": {"recordings", "messages", "replay"},
         "node": {"messages"},
     },
     "dyfn_worlds": {

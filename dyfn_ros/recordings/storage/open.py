@@ -31,7 +31,10 @@ READERS: dict[str, Callable[[Path], Storage]] = {
 }
 SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active")
 PACKED = (".zstd", ".zst")  # rosbag2's compression by file
-EXPECTED = "a rosbag2 folder, an .mcap, .db3 or .bag file (also .zstd of one), or an RGB-D folder"
+EXPECTED = (
+    "a rosbag2 folder, an .mcap, .db3 or .bag file (also .zstd of one), an RGB-D folder, a video "
+    "file or a folder of pictures"
+)
 _FREE = 1 << 30  # bytes that unpacking leaves on the disk
 
 

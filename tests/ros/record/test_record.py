@@ -13,6 +13,7 @@ from dyfn_ros.record.cli import ALL, PARTIAL, UNUSABLE, main
 from dyfn_ros.recordings.open import RecordedFrame, open_recording
 from dyfn_ros.recordings.poses import open_poses
 from tests.support.made_benchmarks import over_colour
+from tests.support.made_videos import make_video
 
 H, W = 24, 32
 STEREO_STAMPS = ("1305031102.175304", "1305031102.211214", "1305031103.275326")
@@ -129,22 +130,6 @@ def test_a_folder_comes_back_as_it_was(tmp_path: Path, layout, name, options) ->
         np.testing.assert_allclose(found, pose(index), atol=1e-9)  # type: ignore[arg-type]
 
 
-def film(path: Path, times: list[float]) -> Path:
-    """A video whose frames are at these seconds, grey of 20 x their index."""
-    base = Fraction(1, 90_000)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=30)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        stream.codec_context.time_base = stream.time_base = base
-        for index, time in enumerate(times):
-            image = np.full((48, 64, 3), 20 * index, np.uint8)
-            frame = av.VideoFrame.from_ndarray(image)
-            frame.pts, frame.time_base = round(time * 90_000), base
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
-
-
 def raw_stream(path: Path, codec: str, container: str) -> Path:
     """Ten frames, grey of 20 x their index, without times."""
     with av.open(str(path), "w", format=container) as file:
@@ -243,7 +228,7 @@ CALIBRATION = {
 
 def test_a_video_keeps_the_times_of_its_frames(tmp_path: Path) -> None:
     times = [0, 0.04, 0.2, 0.25, 1.5]
-    frames = made(film(tmp_path / "v.mp4", times), tmp_path / "walk.mcap", "--colour", "raw")
+    frames = made(make_video(tmp_path / "v.mp4", times), tmp_path / "walk.mcap", "--colour", "raw")
     assert [f.stamp_ns / 1e9 for f in frames] == pytest.approx(times, abs=2e-4)
     assert [f.image.mean() for f in frames] == pytest.approx([0, 20, 40, 60, 80], abs=2)
     assert all(f.camera_matrix is None and f.depth is None for f in frames)
@@ -253,7 +238,7 @@ def test_a_video_keeps_the_times_of_its_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("by_file", [True, False])
 def test_a_video_is_given_a_lens(tmp_path: Path, by_file: bool) -> None:
-    film(tmp_path / "v.mp4", [0, 0.1])
+    make_video(tmp_path / "v.mp4", [0, 0.1])
     (tmp_path / "cam.yaml").write_text(yaml.safe_dump(CALIBRATION))
     numbers = [
         "--intrinsics",
@@ -293,7 +278,7 @@ def wrong(tmp_path: Path, *arguments: object) -> int:
 def test_a_wrong_calibration_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict, message: str
 ) -> None:
-    film(tmp_path / "v.mp4", [0])
+    make_video(tmp_path / "v.mp4", [0])
     (tmp_path / "cam.yaml").write_text(yaml.safe_dump(CALIBRATION | change))
     arguments = (tmp_path / "v.mp4", "--camera-info", tmp_path / "cam.yaml")
     assert wrong(tmp_path, *arguments) == UNUSABLE

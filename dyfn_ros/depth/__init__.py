@@ -1,0 +1,1 @@
+"""dyfn-depth: depth of pictures, videos and cameras."""

@@ -1,0 +1,127 @@
+"""A run in the Rerun viewer: live, or as a file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from dyfn_core.files import OutputError
+from dyfn_core.prediction import Prediction
+from dyfn_ros.depth.source import SourceFrame
+from dyfn_ros.replay.rerun import RerunFile, load_rerun, log_frame
+
+APPLICATION = "dyfn_depth"
+SHOWN = 960  # pixels of the longer side of what the viewer gets
+MEMORY = "2GB"  # that the viewer keeps; older frames go
+
+
+def blueprint(rerun: Any) -> Any:
+    """Image and depth left, points and the scale over time right."""
+    views = rerun.blueprint
+    pictures = views.Vertical(
+        views.Spatial2DView(origin="camera/image", name="image"),
+        views.Spatial2DView(origin="camera/depth", name="depth"),
+    )
+    plots = views.Vertical(
+        views.Spatial3DView(origin="/", contents=["/points", "/camera"], name="points"),
+        views.TimeSeriesView(origin="scores", name="scale over time"),
+        row_shares=[3, 1],
+    )
+    return views.Blueprint(views.Horizontal(pictures, plots, column_shares=[2, 3]))
+
+
+class _View:
+    """Shows frames on a stream of Rerun."""
+
+    def __init__(self, recording: Any) -> None:
+        self._recording, self._frames = recording, 0
+
+    def show(self, frame: SourceFrame, prediction: Prediction[np.ndarray]) -> None:
+        """One frame, in order."""
+        self._recording.set_time("frame", sequence=self._frames)
+        self._recording.set_time("seconds", duration=frame.stamp)
+        self._frames += 1
+        image, small = _shrunk(frame.image, prediction)
+        log_frame(self._recording, image, small, scale_values(prediction))
+
+
+def scale_values(prediction: Prediction[np.ndarray]) -> dict[str, float]:
+    """What tells a steady scale: the median depth, in metres where it is known."""
+    values: dict[str, float] = {}
+    valid = prediction.valid
+    if valid.any():
+        name = "median_depth_m" if prediction.metric else "median_depth"
+        values[name] = float(np.median(prediction.depth[valid]))
+    if prediction.metric and prediction.unit > 0:
+        values["metres_per_unit"] = float(prediction.unit)
+    return values
+
+
+def _shrunk(
+    image: np.ndarray, prediction: Prediction[np.ndarray]
+) -> tuple[np.ndarray, Prediction[np.ndarray]]:
+    """Every s-th pixel of what is larger than SHOWN."""
+    step = math.ceil(max(image.shape[:2]) / SHOWN)
+    if step == 1:
+        return image, prediction
+    grid = (slice(step // 2, None, step),) * 2
+    small = replace(
+        prediction,
+        points=prediction.points[grid],
+        depth=prediction.depth[grid],
+        mask=prediction.mask[grid],
+        known_camera=None,  # the normalised intrinsics hold for any size
+    )
+    return image[grid], small
+
+
+class LiveView(_View):
+    """A viewer's window, which stays open when the run ends."""
+
+    def __init__(self, name: str) -> None:
+        """Open the viewer. Raises OutputError."""
+        rerun = load_rerun()
+        recording = rerun.RecordingStream(APPLICATION, recording_id=name)
+        try:
+            recording.spawn(memory_limit=MEMORY, default_blueprint=blueprint(rerun))
+        except (OSError, RuntimeError) as error:
+            raise OutputError(f"--view: the Rerun viewer cannot be opened: {error}") from error
+        super().__init__(recording)
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._recording.flush(timeout_sec=5.0)
+        self._recording.disconnect()
+
+
+class FileView(_View):
+    """The same as a file for the viewer."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        """Begin the file. Raises OutputError."""
+        self._file = RerunFile(path, APPLICATION, name, blueprint)
+        super().__init__(self._file.recording)
+
+    def __enter__(self) -> FileView:
+        self._file.__enter__()
+        return self
+
+    def show(self, frame: SourceFrame, prediction: Prediction[np.ndarray]) -> None:
+        """One frame, in order. Raises OutputError when the disk is nearly full."""
+        self._file.require_room()
+        super().show(frame, prediction)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.__exit__(kind, error, trace)
