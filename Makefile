@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | lint | coverage | bench        (see README.md)
+# make setup | demo | test | test-fast | lint | coverage | bench | gpu-train    (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test test-fast coverage lint bench clean
+.PHONY: setup demo test test-fast coverage lint bench gpu-train clean
 
 setup: $(READY)
 
@@ -36,6 +36,10 @@ lint: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/speed.py
+
+# e.g. make gpu-train GPU_TRAIN="--art out/art --minutes 10"      (see docs/training.md)
+gpu-train: $(READY)
+	$(BIN)/python benchmarks/gpu_train.py $(GPU_TRAIN)
 
 clean:
 	rm -rf $(VENV) build install log out

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 import yaml
 
-from dyfn_core.argument_types import at_least_one
+from dyfn_core.argument_types import at_least_one, finite
 from dyfn_core.cli import experiments
 from dyfn_core.cli.arguments import (
     Commands,
@@ -28,7 +28,7 @@ from dyfn_core.data.datasets import RENDERED
 from dyfn_core.data.pool import resolve
 from dyfn_core.data.rendered import list_shards
 from dyfn_core.data.sequences import clip_frames, folder_frames
-from dyfn_core.evaluation.variants import score_variants, variant_table
+from dyfn_core.evaluation.variants import harmed, score_variants, variant_table
 from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.scoring.variants import VariantScore
 from dyfn_core.training.average import average
@@ -73,8 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     try:
         if options.command == "evaluate":
-            print(variant_table(_evaluate(options)))
-            return 0
+            return _tell_scores(_evaluate(options), options.most_harm)
         if options.command == "experiments":
             experiments.run(options)
             return 0
@@ -202,6 +201,19 @@ def _curve(options: argparse.Namespace) -> None:
         print(f"{metric}: {rows[-1][metric]:.4f} after {rows[-1]['images']:.0f} images{told}")
 
 
+def _tell_scores(results: dict[str, dict[str, VariantScore]], most_harm: float | None) -> int:
+    """The table; with --most-harm also where DyFN does more harm, and then exit status 1."""
+    print(variant_table(results))
+    worse = {} if most_harm is None else harmed(results, most_harm / 100)
+    for name, change in worse.items():
+        print(
+            f"dyfn-train: {name}: DyFN's video AbsRel is {100 * change:.1f}% above the base's, "
+            f"more than --most-harm {most_harm:g}%",
+            file=sys.stderr,
+        )
+    return 1 if worse else 0
+
+
 def _evaluate(options: argparse.Namespace) -> dict[str, dict[str, VariantScore]]:
     if not options.data:
         raise ValueError("nothing to evaluate on: give --data with a rendered or an RGB-D folder")
@@ -319,6 +331,13 @@ def _add_evaluate(commands: Commands) -> None:
         "--clips", type=at_least_one, default=12, metavar="N", help="score N clips (default: 12)"
     )
     add_stride(command)
+    command.add_argument(
+        "--most-harm",
+        type=finite,
+        metavar="PERCENT",
+        help="exit code 1 where DyFN's video AbsRel is above the base's by more; a negative one "
+        "asks for a gain (default: no check)",
+    )
 
 
 if __name__ == "__main__":

@@ -194,6 +194,20 @@ def gap_closed(scores: dict[str, VariantScore], variant: str = "dyfn") -> float:
     return (base.video_abs_rel - scores[variant].video_abs_rel) / gap if gap else 0.0
 
 
+def harmed(results: dict[str, dict[str, VariantScore]], share: float) -> dict[str, float]:
+    """Where DyFN makes the video AbsRel worse than the base's, by more than a share of it.
+
+    Returns:
+        By data set, the relative change; nothing for a model without DyFN.
+    """
+    changes = {
+        name: scores["dyfn"].video_abs_rel / scores["base"].video_abs_rel - 1
+        for name, scores in results.items()
+        if "dyfn" in scores
+    }
+    return {name: change for name, change in changes.items() if change > share}
+
+
 def variant_table(results: dict[str, dict[str, VariantScore]]) -> str:
     """A Markdown table: a row per variant, AbsRel / delta1 for image and video per data set."""
     head = ["", *(f"{name} {kind}" for name in results for kind in ("image", "video"))]

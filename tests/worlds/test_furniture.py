@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.pack_art import pack, pack_furniture
 from dyfn_worlds.rooms.furniture import Showroom, read_library
 
 CATALOGUE = """id=Made
@@ -64,3 +65,21 @@ def test_a_file_without_a_catalogue_is_refused_by_name(tmp_path: Path) -> None:
         archive.writestr("readme.txt", "nothing")
     with pytest.raises(ValueError, match=r"other\.sh3f"):
         read_library(path)
+
+
+def test_a_packed_piece_is_the_same_piece(library: Path, tmp_path: Path) -> None:
+    (piece,) = read_library(library)
+    assert pack_furniture([piece], tmp_path / "small.sh3f", 10_000) == 1
+    (packed,) = (small := Showroom([tmp_path / "small.sh3f"])).pieces
+    assert (packed.name, packed.category) == (piece.name, piece.category)
+    assert packed.size == pytest.approx(piece.size)
+    for before, after in zip(Showroom([library]).parts(piece), small.parts(packed), strict=True):
+        np.testing.assert_allclose(after.positions, before.positions, atol=1e-6)
+        np.testing.assert_array_equal(after.color, before.color)
+    assert pack_furniture([piece], tmp_path / "none.sh3f", 100) == 0
+
+
+def test_art_without_anything_to_render_from_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "art").mkdir()
+    with pytest.raises(FileNotFoundError, match="no furniture, map, photograph or texture"):
+        pack(tmp_path / "art", tmp_path / "out", 1.0)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.pack_art import RecordedFiles, pack_maps
 from dyfn_worlds.maps import quake
 
 
@@ -128,3 +129,15 @@ def test_shader_scripts_say_what_is_hidden() -> None:
         "textures/s/w.tga",
         False,
     )
+
+
+def test_a_packed_map_is_the_same_map_and_a_broken_one_is_left_out(
+    game: quake.GameFiles, tmp_path: Path
+) -> None:
+    files, rng = RecordedFiles(game.paths), np.random.default_rng(0)
+    assert pack_maps(files, tmp_path / "small.pk3", 100_000, rng) == ["maps/small.bsp"]
+    packed = quake.GameFiles([tmp_path / "small.pk3"])
+    before, after = (quake.load_map(g, "maps/small.bsp") for g in (game, packed))
+    np.testing.assert_array_equal(after.vertices, before.vertices)
+    np.testing.assert_allclose(after.textures, before.textures, atol=3)  # JPEG
+    assert pack_maps(files, tmp_path / "none.pk3", 500, rng) == []

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from dyfn_core.evaluation.variants import VARIANTS, gap_closed, score_variants, variant_table
+from dyfn_core.evaluation.variants import (
+    VARIANTS,
+    gap_closed,
+    harmed,
+    score_variants,
+    variant_table,
+)
 from dyfn_core.models.controls import StatisticsControl, ema_control, frozen_control, stabilized_by
+from dyfn_core.scoring.variants import VariantScore
 from tests.support.pinhole import PinholeModel, picture
 from tests.support.seeded import normal
 
@@ -91,3 +99,15 @@ def test_sequence_without_truth_is_refused(pinhole: PinholeModel) -> None:
     blind = [(picture(), np.zeros((48, 64), np.float32))]
     with pytest.raises(ValueError, match="no frame with enough valid depth"):
         score_variants(pinhole, [lambda: blind])
+
+
+def test_harm_is_named_by_data_set_with_its_size() -> None:
+    base = VariantScore(0.1, 0.9, 0.200, 0.8)
+    results = {
+        name: {"base": base, "dyfn": replace(base, video_abs_rel=video)}
+        for name, video in (("better", 0.150), ("as good", 0.2019), ("worse", 0.220))
+    }
+    results["without"] = {"base": base}
+    assert harmed(results, 0.01) == {"worse": pytest.approx(0.1)}
+    assert harmed(results, 0.11) == {}
+    assert set(harmed(results, -0.01)) == {"as good", "worse"}

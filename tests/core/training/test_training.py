@@ -10,7 +10,8 @@ import torch
 import yaml
 
 from dyfn_core.cli.train import main
-from dyfn_core.models.checkpoints import load_model
+from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.training.config import (
     BaseRunConfig,
@@ -238,6 +239,19 @@ def test_configs_are_found_beside_an_installed_package(tmp_path: Path) -> None:
     assert config_folders(module) == [installed]
 
 
+def test_harm_above_the_limit_is_exit_code_1_and_told(
+    data: Path, base_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = load_model(base_run / "model.safetensors")
+    latent_channels = model.encode(torch.zeros(1, 3, 64, 64)).features.shape[1]
+    model.stabilizer = build_dyfn(latent_channels, DyFNConfig(hidden=8, pool=4, form="residual"))
+    save_model(model, tmp_path / "dyfn.safetensors")
+    given = ["evaluate", str(tmp_path / "dyfn.safetensors"), "--data", str(data), "--stride", "3"]
+    assert main([*given, "--most-harm", "1000"]) == 0
+    assert main([*given, "--most-harm", "-99"]) == 1
+    assert "held-out clips: DyFN's video AbsRel is" in capsys.readouterr().err
+
+
 def test_a_config_that_is_nowhere_names_the_shipped_ones(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no training config at .*none.yaml; shipped are "):
         read_config(tmp_path / "none.yaml", BaseRunConfig, [])
@@ -250,5 +264,6 @@ def test_evaluate_prints_the_controls(
     assert main(["evaluate", model, "--data", str(data), "--stride", "3"]) == 0
     printed = capsys.readouterr().out
     assert all(f"| {name} |" in printed for name in ("ramp", "constant", "base", "ema", "frozen"))
+    assert main(["evaluate", model, "--data", str(data), "--most-harm", "-99"]) == 0, "has no DyFN"
     assert main(["evaluate", model]) == 1
     assert "nothing to evaluate on" in capsys.readouterr().err
