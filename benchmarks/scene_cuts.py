@@ -1,12 +1,14 @@
 """False alarms and misses of the scene cut detector, on made cuts and on what only looks like one.
 
     python benchmarks/scene_cuts.py --real hololens_room --rendered data/clips [--out out/cuts]
+    python benchmarks/scene_cuts.py --real hololens_room --apart 10
 
 Cuts: two frames that look more than 70 degrees apart (real: one recording, so the same room and
 light), or come from different rendered clips. No cuts: consecutive frames; fast rotation (frames
 apart by 8 to 20 degrees, 80 to 200 degrees a second at 10 Hz); exposure jumps (gain 0.37..2.7,
 gamma 0.7..1.4, in one frame); occlusion (20 to 50% of the next frame covered by another scene).
-The threshold is chosen on the rendered frames and reported on the real ones.
+The threshold is chosen on the rendered frames and reported on the real ones. --apart RATE: every
+k-th frame of the real recording, k = 1 to 10, as if it had RATE frames a second.
 """
 
 from __future__ import annotations
@@ -24,8 +26,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from dyfn_core.stream.scene_cut import (
+    THRESHOLD,
     SceneCutDetector,
     colour_difference,
+    leniency,
+    moving_seconds,
     picture_features,
     scene_difference,
     structure_difference,
@@ -42,10 +47,12 @@ SCORES: dict[str, Callable] = {
 
 @dataclass(frozen=True)
 class Clip:
-    """images: N x H x W x 3 uint8 RGB. axes: N x 3, where the camera looks, in one world."""
+    """images: N x H x W x 3 uint8 RGB. axes: N x 3, where the camera looks, in one world.
+    poses: N x 4 x 4, camera to world."""
 
     images: list[np.ndarray]
     axes: np.ndarray
+    poses: np.ndarray
 
 
 def read_clip(folder: Path) -> Clip:
@@ -56,7 +63,8 @@ def read_clip(folder: Path) -> Clip:
         poses = np.array(json.loads((folder / "meta.json").read_text())["poses"])
     else:
         poses = np.loadtxt(folder / "poses.txt")
-    return Clip(images, poses.reshape(-1, 4, 4)[:, :3, 2])
+    poses = poses.reshape(-1, 4, 4)
+    return Clip(images, poses[:, :3, 2], poses)
 
 
 def angle(clip: Clip, one: int, other: int) -> float:
@@ -224,6 +232,36 @@ def running(clips: Sequence[Clip], threshold: float) -> str:
     )
 
 
+def apart_table(clip: Clip, rate: float, threshold: float, count: int, seed: int) -> str:
+    """False cuts, of every k-th frame of a walk without a cut, and misses of made cuts as far
+    apart in time: with one threshold for all, with that of the time, and of time and poses."""
+    looks = [picture_features(image) for image in clip.images]
+    cuts = Cases([clip], [clip], seed, count)
+    made = [scene_difference(*map(picture_features, cuts.cut())) for _ in range(count)]
+    lines = [
+        "| every | seconds | false cuts, one threshold | time | time and poses "
+        "| missed, one threshold | time | time and poses of a camera at rest |",
+        f"|{' --- |' * 8}",
+    ]
+    for step in range(1, 11):
+        found = [scene_difference(*pair) for pair in zip(looks, looks[step:], strict=False)]
+        moved = [
+            leniency(moving_seconds(step / rate, *pair))
+            for pair in zip(clip.poses, clip.poses[step:], strict=False)
+        ]
+        late = leniency(step / rate)
+        shares = [
+            np.mean(np.array(found) > threshold),
+            np.mean(np.array(found) > threshold * late),
+            np.mean(np.array(found) > threshold * np.array(moved)),
+            *[np.mean(np.array(made) <= threshold * factor) for factor in (1, late, 1)],
+        ]
+        lines.append(
+            f"| {step} | {step / rate:.1f} | {' | '.join(f'{share:.1%}' for share in shares)} |"
+        )
+    return "\n".join(lines)
+
+
 def cost(images: Sequence[np.ndarray], threshold: float) -> float:
     """CPU milliseconds a frame of 640 x 480: median of single frames."""
     large = [cv2.resize(image, (640, 480)) for image in images[:100]]
@@ -239,13 +277,20 @@ def main() -> None:
     """Print the tables and draw the curves."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--real", type=Path, required=True, help="RGB-D folder with poses.txt")
-    parser.add_argument("--rendered", type=Path, required=True, help="folder of rendered clips")
+    parser.add_argument("--rendered", type=Path, help="folder of rendered clips")
+    parser.add_argument("--apart", type=float, metavar="RATE", help="every k-th frame instead")
     parser.add_argument("--every", type=int, default=4, help="use every Nth clip")
     parser.add_argument("--count", type=int, default=500, help="pairs of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/cuts"))
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    if options.apart:
+        clip = read_clip(options.real)
+        print(apart_table(clip, options.apart, THRESHOLD, options.count, options.seed))
+        return
+    if options.rendered is None:
+        parser.error("--rendered is needed, unless --apart is given")
     folders = sorted(meta.parent for meta in options.rendered.glob("*/meta.json"))
     clips = [read_clip(folder) for folder in folders[:: options.every]]
     real = [read_clip(options.real)]

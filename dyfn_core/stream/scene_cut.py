@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -17,6 +18,9 @@ THRESHOLD = 0.6  # where a false alarm weighs as much as three misses: benchmark
 _TEXTURE = 3.0  # grey levels of standard deviation below which a block shows nothing
 _FEWEST = 5  # blocks that must be comparable for a displacement to count
 _BINS = 8  # of the histogram, along each of two chromaticities
+_ADJACENT, _UNRELATED = 0.3, 0.55  # seconds, see leniency
+_LENIENT = 0.75
+_USUAL_TURN, _USUAL_SPEED = math.radians(50), 1.0  # per second, of a walking person's camera
 _BLANK_PATIENCE = 10  # blank pictures before the last scene is forgotten
 
 
@@ -123,18 +127,47 @@ def colour_difference(before: PictureFeatures, now: PictureFeatures) -> float:
 @dataclass(frozen=True)
 class CutState:
     """What the detector remembers: the last picture that showed something, whether the pictures
-    have been alike again since the last cut, and how many blank ones came in a row."""
+    have been alike again since the last cut, how many blank ones came in a row, and that picture's
+    stamp and pose (4 x 4, camera to world), where known."""
 
     look: PictureFeatures | None = None
     armed: bool = True
     blank: int = 0
+    stamp: float | None = None
+    pose: np.ndarray | None = None
+
+
+def leniency(seconds: float) -> float:
+    """What a threshold is multiplied with when so much time lies between the two pictures.
+
+    A camera that moves shows something else after a while: 1 up to 0.3 s, growing evenly to 1.75
+    at 0.55 s, where only pictures that have nothing in common are another scene
+    (benchmarks/scene_cuts.py --apart).
+    """
+    share = (seconds - _ADJACENT) / (_UNRELATED - _ADJACENT)
+    return 1 + _LENIENT * min(max(share, 0.0), 1.0)
+
+
+def moving_seconds(passed: float, before: np.ndarray | None, now: np.ndarray | None) -> float:
+    """The time in which a walking person's camera would have moved so far, at most what passed.
+
+    passed: seconds. before, now: poses, 4 x 4, camera to world in metres; None where unknown.
+    """
+    if before is None or now is None:
+        return max(passed, 0.0)
+    cosine = (float(np.trace(before[:3, :3].T @ now[:3, :3])) - 1) / 2
+    angle = math.acos(min(max(cosine, -1.0), 1.0))
+    distance = float(np.linalg.norm(now[:3, 3] - before[:3, 3]))
+    return min(max(passed, 0.0), max(angle / _USUAL_TURN, distance / _USUAL_SPEED))
 
 
 class SceneCutDetector:
     """Tells, picture by picture, when the camera is suddenly somewhere else.
 
     A cut is reported once: a difference above `threshold`, and then none until the difference
-    has been below `release` times it. Blank pictures are never a cut; the next one that shows
+    has been below `release` times it. The threshold is that of pictures close in time; for others
+    it grows (see leniency) with their stamps' distance, or, where poses are known, with the motion
+    between them. Blank pictures are never a cut; the next one that shows
     something is compared with the last one that did, for up to ten blank ones.
     """
 
@@ -144,9 +177,24 @@ class SceneCutDetector:
         self.threshold, self.release = threshold, release
         self.state = CutState()
         self.difference = math.nan  # of the last two pictures; NaN: not comparable
+        self.allowed = threshold  # the threshold for these two
 
-    def push(self, image: np.ndarray) -> bool:
-        """image: H x W x 3 uint8 RGB. -> whether it begins a new scene."""
+    def push(
+        self,
+        image: np.ndarray,
+        stamp: float | None = None,
+        pose: Callable[[], np.ndarray | None] = lambda: None,
+    ) -> bool:
+        """Look at the next picture.
+
+        Args:
+            image: H x W x 3 uint8 RGB.
+            stamp: Seconds; None where unknown.
+            pose: Gives 4 x 4, camera to world, metres, or None; asked only where it decides.
+
+        Returns:
+            Whether the image begins a new scene.
+        """
         look, state = picture_features(image), self.state
         self.difference = math.nan
         if look.blank:
@@ -155,13 +203,23 @@ class SceneCutDetector:
             self.state = replace(state, look=old, blank=state.blank + 1)
             return False
         if state.look is None:
-            self.state = CutState(look)
+            self.state = CutState(look, stamp=stamp)
             return False
         self.difference = scene_difference(state.look, look)
-        cut = state.armed and self.difference > self.threshold
-        armed = not cut and (state.armed or self.difference < self.release * self.threshold)
-        self.state = CutState(look, armed)
+        passed = 0.0 if stamp is None or state.stamp is None else stamp - state.stamp
+        factor = leniency(passed)
+        if factor > 1 and state.pose is not None and self.difference > self.threshold:
+            factor = leniency(moving_seconds(passed, state.pose, pose()))
+        self.allowed = self.threshold * factor
+        cut = state.armed and self.difference > self.allowed
+        armed = not cut and (state.armed or self.difference < self.release * self.allowed)
+        self.state = CutState(look, armed, stamp=stamp)
         return cut
+
+    def locate(self, stamp: float | None, pose: np.ndarray | None) -> None:
+        """The pose of the picture of this stamp, if it is the last that showed something."""
+        if not self.state.blank and stamp is not None and self.state.stamp == stamp:
+            self.state = replace(self.state, pose=pose)
 
     def reset(self) -> None:
         """Forget the last picture."""

@@ -25,7 +25,7 @@ from dyfn_core.stream.resets import (
 )
 from dyfn_core.stream.saving import Loaded, StateKeeper, StreamSettings
 from dyfn_core.stream.scale_stage import ScaleStage
-from dyfn_core.stream.scene_cut_stage import SceneCutStage
+from dyfn_core.stream.scene_cut_stage import Place, SceneCutStage
 from dyfn_core.stream.stages import StreamStage
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ class StreamSession:
         stages: Scene cuts, unusable pictures, metric scale, and those that were given, in this
             order.
         resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
+        last_reset: The last reset as a line of a log; "" before the first.
         stream: What holds the memory; None before the first frame and after a failed one.
 
     Example:
@@ -101,10 +102,14 @@ class StreamSession:
         by_motion = options.metric_source == MotionStage.source
         metric: type[ScaleStage] = MotionStage if by_motion else MetricStage
         self._metric = metric(lambda: self._options)
-        cuts = SceneCutStage(lambda: self._options.scene_cut_threshold)
+        cuts = SceneCutStage(
+            lambda: self._options.scene_cut_threshold, lambda frame: self._place(frame)
+        )
         self._pictures = PictureStage(lambda: self._options)
         self.stages: tuple[StreamStage, ...] = (cuts, self._pictures, self._metric, *stages)
         self.resets: Counter[str] = Counter()
+        self.last_reset = ""
+        self._place: Place = _as_it_is
         self.stream: DepthStream | None = None
         self.asked = ResetRequest()
         self._keeper = StateKeeper(self.stages, model)
@@ -284,12 +289,28 @@ class StreamSession:
             self.fail()
             raise
 
-    def begin(self, frame: Frame, asked: ResetRequest | None = None) -> DepthStream:
+    def skip(self, frame: Frame) -> None:
+        """Look at a frame that is not worked on, for want of time: it may show a scene cut.
+
+        Pictures that are close in time tell a cut from a motion, those far apart do not. The next
+        frame that is pushed then resets the stream.
+
+        Args:
+            frame: As for push; of a time between the last frame and the next.
+        """
+        for stage in self.stages:
+            stage.skipped(frame)
+
+    def begin(
+        self, frame: Frame, asked: ResetRequest | None = None, place: Place | None = None
+    ) -> DepthStream:
         """The half of push before the network, for callers that run several cameras in a batch.
 
         Args:
-            frame: As for push.
+            frame: As for push. Its pose may still be unknown, if `end` gets it.
             asked: As for push.
+            place: Gives the frame its pose; asked only when the reset depends on it, since the
+                pose may have to be waited for. None: the frame has it, or has none.
 
         Returns:
             The stream that the frame goes into (see push_together), reset if it must be. `end`
@@ -297,6 +318,7 @@ class StreamSession:
         """
         asked = self.asked if asked is None else asked
         self._adopt(asked)
+        self._place = place or _as_it_is
         first = self.stream is None and not self._failed
         reason = None if first else self._reason(frame, asked)
         for stage in self.stages:
@@ -304,6 +326,8 @@ class StreamSession:
             reason = reason or (None if first else found)
         if self.stream is None or reason:
             self.stream = self._start(frame, reason)
+        if reason:
+            self.last_reset = self._told(frame, reason)
         self.stream.rules = self._options.time_rules
         self._done, self._settings = asked, self._settings_with(frame.frame_id)
         self._failed = False
@@ -360,6 +384,14 @@ class StreamSession:
             return NEW_CAMERA
         return None if now == self._settings else NEW_SETTINGS
 
+    def _told(self, frame: Frame, reason: str) -> str:
+        """A reset as a line of a log: when, why, and what the stage that asked for it measured."""
+        when = "" if frame.stamp is None else f"at {frame.stamp:.3f} s: "
+        for stage in self.stages:
+            if measured := stage.report().get(reason):
+                reason = f"{reason} ({measured})"
+        return f"{when}{reason}"
+
     def _settings_with(self, frame_id: str) -> StreamSettings:
         return StreamSettings(self._options.stabilize, self._options.num_tokens, frame_id)
 
@@ -373,3 +405,7 @@ class StreamSession:
         for stage in self.stages:
             stage.started(reason)
         return stream
+
+
+def _as_it_is(frame: Frame) -> Frame:
+    return frame

@@ -36,6 +36,9 @@ class StreamStage:
         """A reason to reset the stream before this frame, or None."""
         return None
 
+    def skipped(self, frame: Frame) -> None:
+        """A frame between the last one and the coming one that is not worked on."""
+
     def started(self, reason: str | None) -> None:
         """The stream begins with the coming frame: reset for a reason, or None for the first."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,7 @@ from dyfn_ros.node.metric_scale import ScaleTopics
 from dyfn_ros.node.odometry import OdometryTopic, TransformTopics
 from dyfn_ros.node.outputs import NodeOutputs
 from dyfn_ros.node.parameters.table import NodeSettings
+from dyfn_ros.node.recent_jobs import RecentJobs
 from dyfn_ros.node.statistics import FrameStatistics
 from dyfn_ros.node.topics import NodeTopics
 
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
 _SENSOR_DEPTH = 5
+_LOOK_TIME = 0.1  # seconds before each frame for looks at the dropped ones
 
 Say = Callable[[str], None]
 
@@ -54,7 +57,8 @@ class Camera:
 
     name: "" for a camera without a name of its own. settings: the values in force, asked for
     each frame. transforms: of all cameras. submit: takes a Job, -> whether it was accepted.
-    release: a CameraInfo has come. warn: for what costs a frame its use.
+    release: a CameraInfo has come. warn: for what costs a frame its use. told_reset: takes each
+    reset's line.
     """
 
     def __init__(
@@ -68,6 +72,7 @@ class Camera:
         release: Callable[[], None],
         warn: Say,
         error: Say,
+        told_reset: Say,
     ) -> None:
         self.name = name
         self.title = f"{node.get_name()}: {name}" if name else node.get_name()
@@ -78,8 +83,11 @@ class Camera:
         self.outputs = NodeOutputs(ports, self.prefix, not settings().drop_frames)
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
+        self._told_reset = told_reset
         self._info: CameraInfo | None = None
         self._faults: list[str] = []
+        self._came: RecentJobs[FrameJob] = RecentJobs()  # with drop_frames: what may be dropped
+        self._placed: Frame | None = None  # the begun frame, if its pose was wanted at once
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
         self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings())
@@ -137,12 +145,15 @@ class Camera:
         self.statistics.count("received" if self.active else "inactive")
         session = self.session
         if not self.active or session is None:
+            self._came.clear()
             return
         if self._info is None:
             self._latched_info.check()
             if self.waits_for_info:
                 self._warn(f"{self.image_topic}: {self.waiting}")
         job = FrameJob(self, message, self._info, session.asked, time.monotonic())
+        if self.settings.drop_frames:
+            self._came.add(job)
         if not self._submit(job):
             self._error(
                 f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
@@ -224,16 +235,39 @@ class Camera:
         )
         return frame, view.info
 
-    def begin(self, frame: Frame, asked: ResetRequest) -> DepthStream:
+    def begin(self, job: FrameJob, frame: Frame) -> DepthStream:
         """-> the DepthStream that the frame goes into."""
         session = self._opened()
         session.options = self.settings
-        return session.begin(frame, asked)
+        self._look_at_dropped(session, job)
+        self._placed = None
+
+        def place(frame: Frame) -> Frame:
+            self._placed = self._place(job, frame)
+            return self._placed
+
+        return session.begin(frame, job.asked, place)
+
+    def _look_at_dropped(self, session: StreamSession, job: FrameJob) -> None:
+        """Let the session see the pictures that came since the frame before, and were dropped."""
+        if not self.settings.scene_cut_threshold:
+            self._came.clear()
+            return
+        until = time.monotonic() + _LOOK_TIME
+        for dropped in self._came.before(job):
+            if time.monotonic() > until:
+                return
+            with suppress(Exception):  # a bad image; it is counted as dropped
+                session.skip(self.decode(dropped)[0])
+
+    def _place(self, job: FrameJob, frame: Frame) -> Frame:
+        until = job.arrived + self.settings.odometry_wait
+        return self.odometry.placed(frame, job.message.header, until)
 
     def end(self, job: FrameJob, frame: Frame, prediction: Prediction) -> Prediction[np.ndarray]:
         """-> what to publish."""
-        session, until = self._opened(), job.arrived + self.settings.odometry_wait
-        frame = self.odometry.placed(frame, job.message.header, until)
+        session, placed = self._opened(), self._placed
+        frame = self._place(job, frame) if placed is None else placed
         found = session.end(frame, prediction)
         faults = session.faults()
         self._tell(faults)
@@ -257,6 +291,8 @@ class Camera:
         header = job.message.header
         if found.reset:
             self.outputs.publish_reset(header, self.title, found.reset, self.resets)
+            assert self.session is not None
+            self._told_reset(f"{self.image_topic}: the stream is reset {self.session.last_reset}")
         self.outputs.publish(header, frame.image, found, info, self.settings)
         stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         self.statistics.published(

@@ -42,7 +42,7 @@ def run_jobs(jobs: Sequence[FrameJob], batch: bool) -> None:
 def _begin(job: FrameJob) -> _Begun | None:
     try:
         frame, info = job.camera.decode(job)
-        return _Begun(job, frame, info, job.camera.begin(frame, job.asked))
+        return _Begun(job, frame, info, job.camera.begin(job, frame))
     except MessageError as error:
         job.camera.bad(job, error)
     except Exception as error:

@@ -58,7 +58,7 @@ class StreamDepthNode(LifecycleNode):
         **node_options: Any,
     ) -> None:
         super().__init__("stream_depth", **node_options)
-        self._throttle = Throttle()
+        self._throttle, self._reset_throttle = Throttle(), Throttle()
         guard_services(self, self._warn)
         self._load, self._ending = load, ending
         self._phase = "unconfigured"
@@ -94,6 +94,10 @@ class StreamDepthNode(LifecycleNode):
     def _error(self, text: str) -> None:
         if line := self._throttle(text):
             self.get_logger().error(line)
+
+    def _tell_reset(self, text: str) -> None:
+        if line := self._reset_throttle(text):
+            self.get_logger().warning(line)
 
     def callback_failed(self, error: Exception) -> None:
         """A callback raised, which nobody foresaw: it is counted, and the node goes on."""
@@ -213,6 +217,7 @@ class StreamDepthNode(LifecycleNode):
             release=lambda: worker.release(index),
             warn=self._warn,
             error=self._error,
+            told_reset=self._tell_reset,
         )
 
     def _make_services(self) -> None:

@@ -133,6 +133,7 @@ def _write_report(path: Path, metrics: dict[str, Any], result: Result) -> None:
         *([topic, value] for topic, value in recording["topics"].items()),
         *([f"resets, {reason}", count] for reason, count in metrics.get("resets", {}).items()),
         *([f"pictures without depth, {why}", count] for why, count in blind.items()),
+        *(["reset", line] for line in metrics.get("reset_log", [])),
         *([f"metric scale, {k}", v] for k, v in metrics.get("metric_scale", {}).items()),
         *([f"state {what}", text] for what, text in metrics.get("state", {}).items()),
         *([name, value] for name, value in metrics["options"].items() if value is not None),

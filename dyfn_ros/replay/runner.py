@@ -20,6 +20,8 @@ from dyfn_ros.replay.settings import Run
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
+_RESET_LINES = 100  # of the first resets; all of them are counted
+
 
 @dataclass(frozen=True)
 class RunFrame:
@@ -62,6 +64,7 @@ class StreamRunner:
         self._run, self._references, self._poses = run, references, poses
         self._session = StreamSession(model, run.stream)
         self._state: dict[str, str] = {}
+        self._reset_lines: list[str] = []
         if run.save_state:
             _check_folder(run.stream.state_file)
         if run.load_state:
@@ -94,6 +97,8 @@ class StreamRunner:
                 None if placed is None else placed.variance,
             )
             prediction = self._session.push(pushed)
+            if prediction.reset and len(self._reset_lines) < _RESET_LINES:
+                self._reset_lines.append(self._session.last_reset)
             yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
 
     @property
@@ -111,6 +116,8 @@ class StreamRunner:
         found: dict[str, Any] = {"resets": dict(self._session.resets)}
         if unusable := self._session.unusable_pictures:
             found["pictures_without_depth"] = dict(unusable)
+        if self._reset_lines:
+            found["reset_log"] = self._reset_lines
         if self._run.stream.metric_source != "none":
             found["metric_scale"] = self._session.scale.described()
         if self._poses is not None and (facts := self._poses.facts()):

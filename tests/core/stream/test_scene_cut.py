@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
 
-from dyfn_core.stream.scene_cut import SceneCutDetector, picture_features, scene_difference
+from dyfn_core.prediction import Frame
+from dyfn_core.stream.resets import SCENE_CUT
+from dyfn_core.stream.scene_cut import (
+    SceneCutDetector,
+    leniency,
+    picture_features,
+    scene_difference,
+)
+from dyfn_core.stream.session import StreamSession
+from tests.support.tiny_model import load_tiny
 
 
 def scene(seed: int, width: int = 480, height: int = 240) -> np.ndarray:
@@ -109,6 +120,82 @@ def test_a_remembered_state_goes_on_alike() -> None:
     for image in (seen(scene(0), 20), seen(scene(1), 0), seen(scene(1), 20)):
         assert one.push(image) == other.push(image)
         assert one.difference == other.difference
+
+
+def test_the_longer_ago_the_last_picture_the_more_may_have_changed() -> None:
+    before, now = seen(scene(3), 0), seen(scene(4), 0)
+    cuts = []
+    for seconds in (0.1, 0.2, 0.4, 0.6, 2.0):
+        detector = SceneCutDetector()
+        detector.push(before, 10.0)
+        cuts.append(detector.push(now, 10.0 + seconds))
+        assert detector.allowed == pytest.approx(0.6 * leniency(seconds))
+    assert cuts[:2] == [True, True]
+    assert not cuts[-1]
+    assert cuts == sorted(cuts, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "metres", "cut"), [(2, 0.02, True), (60, 0.0, False), (0, 1.0, False)]
+)
+def test_a_pose_says_whether_the_time_was_used_to_move(
+    degrees: float, metres: float, cut: bool
+) -> None:
+    """A second later: a camera at rest sees another scene only after a cut."""
+    detector, pose = SceneCutDetector(), np.eye(4)
+    turn = np.radians(degrees)
+    pose[:3, :3] = cv2.Rodrigues(np.array([0.0, turn, 0.0]))[0]
+    pose[2, 3] = metres
+    detector.push(seen(scene(3), 0), 10.0)
+    detector.locate(10.0, np.eye(4))
+    assert detector.push(seen(scene(4), 0), 11.0, lambda: pose) is cut
+
+
+def test_a_pose_is_asked_for_only_where_it_decides() -> None:
+    def unwanted() -> np.ndarray:
+        raise AssertionError("asked for")
+
+    detector = SceneCutDetector()
+    for stamp, picture in ((10.0, scene(3)), (11.0, scene(3)), (11.1, scene(4))):
+        detector.push(seen(picture, 0), stamp, unwanted)
+        detector.locate(stamp, np.eye(4))
+
+
+def test_pictures_that_are_skipped_tell_a_cut_from_a_walk() -> None:
+    """Ten pictures a second of which every tenth is worked on."""
+
+    def resets(pictures: list[np.ndarray], skip: bool) -> dict[str, int]:
+        session = StreamSession(load_tiny())
+        for index, picture in enumerate(pictures):
+            frame = Frame(cv2.resize(picture, (96, 72)), index / 10)
+            if index % 10 == 0:
+                session.push(frame)
+            elif skip:
+                session.skip(frame)
+        return dict(session.resets)
+
+    panorama = scene(5, 2400)
+    walk = [seen(panorama, 40 * index) for index in range(41)]
+    cut = [seen(scene(6 + index // 25), 2 * (index % 25)) for index in range(41)]
+    assert resets(walk, True) == resets(walk, False) == {}
+    assert resets(cut, True) == {SCENE_CUT: 1}
+
+
+def test_a_reset_is_told_with_its_time_reason_and_measure() -> None:
+    session = StreamSession(load_tiny())
+    for index, seed in enumerate((3, 3, 4)):
+        session.push(cv2.resize(seen(scene(seed), 0), (96, 72)), index / 10)
+    assert re.fullmatch(r"at 0\.200 s: scene cut \(difference .* of 0\.600\)", session.last_reset)
+    session.request_reset()
+    session.push(cv2.resize(seen(scene(4), 0), (96, 72)), 0.3)
+    assert session.last_reset == "at 0.300 s: requested"
+
+
+def test_without_stamps_pictures_are_taken_for_consecutive() -> None:
+    detector = SceneCutDetector()
+    detector.push(seen(scene(3), 0), 10.0)
+    assert detector.push(seen(scene(4), 0))
+    assert detector.allowed == detector.threshold
 
 
 @pytest.mark.parametrize("options", [{"threshold": 0.0}, {"threshold": 3.0}, {"release": 0.0}])

@@ -21,6 +21,7 @@ from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.camera_info import decode_camera_info
 from dyfn_ros.messages.clouds import cloud_points
+from tests.core.stream.test_scene_cut import scene, seen
 from tests.support.made_pictures import png
 from tests.support.ros_graph import (
     DEADLINE,
@@ -50,6 +51,10 @@ class Graph:
         node = tiny_node({**self._domain, **self.gate.environment}, self._folder, **parameters)
         self._nodes.append(node)
         return node
+
+    @property
+    def node(self) -> NodeProcess:
+        return self._nodes[-1]
 
     def connect(self, **options: Any) -> Client:
         client = Client(self._domain, **options)
@@ -394,6 +399,31 @@ def test_only_the_latest_frame_waits(live: tuple[Graph, Client]) -> None:
     graph.gate.open()
     client.result(stamps[-1])
     assert client.order == [first, stamps[-1]]
+
+
+def test_a_cut_among_dropped_frames_resets_the_stream_and_is_logged(
+    live: tuple[Graph, Client],
+) -> None:
+    """A second of network time, in which ten pictures come; only the last is worked on."""
+    graph, client = live
+    client.prime()
+    assert client.set_parameter("scene_cut_threshold", 0.6).successful
+    client._stamp += 1
+    pictures = [seen(scene(7 + index // 5), 4 * index) for index in range(10)]
+    for index, picture in enumerate(pictures):
+        message = image_message(cv2.resize(picture, (96, 72)))
+        if index == 0:
+            message.data[:3] = array.array("B", BLOCKING)
+        message.header.frame_id = "optical"
+        message.header.stamp.sec, message.header.stamp.nanosec = client._stamp, index * 10**8
+        client.images.publish(message)
+        if index == 0:
+            graph.gate.wait_entered()
+        client.spin_until(lambda: False, 0.16)
+    graph.gate.open()
+    place = rf"/image: the stream is reset at {client._stamp}.900 s"
+    graph.node.wait_log(rf"{place}: scene cut \(difference .* of 0.600\)")
+    assert client.set_parameter("scene_cut_threshold", 0.0).successful
 
 
 def test_depth_alone_is_built_for_its_subscriber_and_an_interrupt_waits_for_nobody(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
 from dyfn_ros.node.log_throttle import Throttle
+from dyfn_ros.node.recent_jobs import RecentJobs
 from dyfn_ros.node.worker import FrameWorker
 
 DEADLINE = 20.0
@@ -165,3 +168,29 @@ def test_the_throttle_never_passes_more_than_its_limit(events: list[tuple[int, f
         if throttle(str(text)):
             passed.append(clock.now)
     assert all(sum(at - 5 < other <= at for other in passed) <= 4 for at in passed)
+
+
+@dataclass(frozen=True)
+class Arrived:
+    arrived: float
+
+
+def test_recent_jobs_are_thinned_out_and_end_with_the_one_worked_on() -> None:
+    recent: RecentJobs[Arrived] = RecentJobs()
+    jobs = [Arrived(index / 30) for index in range(40)]
+    for job in jobs:
+        recent.add(job)
+    found = recent.before(jobs[30])
+    steps = np.diff([job.arrived for job in found])
+    assert found[0] is jobs[0] and jobs[30] not in found
+    assert steps.max() < 0.2
+    assert len(found) < 10
+    assert recent.before(jobs[30]) == []
+    assert recent.before(jobs[39])[0].arrived > 1.0
+
+
+def test_recent_jobs_are_few_however_long_nobody_asks() -> None:
+    recent: RecentJobs[Arrived] = RecentJobs()
+    for index in range(1000):
+        recent.add(Arrived(float(index)))
+    assert len(recent.before(Arrived(2000.0))) == 16

@@ -175,9 +175,15 @@ def test_time_rules_and_scene_cuts(session: Callable[..., Session]) -> None:
     seconds = [10, 11, 30, 31, 29, 32, 33, 34, 35]
     pictures = [one, one, one, one, one, one, one, other, other]
     sent = images(seconds, pictures)
+    sent[6].header.stamp.nanosec = 950_000_000  # the cut is between pictures close in time
     live = bench.live(sent)
     offline, metrics = bench.replay(sent)
     assert live == offline
+    assert [line.partition(" (")[0] for line in metrics["reset_log"]] == [
+        "at 30.000 s: gap between stamps",
+        "at 29.000 s: stamp went back",
+        "at 34.000 s: scene cut",
+    ]
     assert metrics["resets"] == {
         "gap between stamps": 1,
         "stamp went back": 1,
