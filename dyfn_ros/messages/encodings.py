@@ -161,17 +161,49 @@ def _luma_stride(raster: Raster, tight: int) -> int:
     return raster.step
 
 
-def _decode_nv21(raster: Raster) -> np.ndarray:
-    """Y plane, then VU pairs at half the resolution both ways, in rows of the same step."""
+def _luma_420(raster: Raster, planes: int) -> tuple[np.ndarray, int]:
+    """Y plane, and the stride of its rows, of an image whose chroma has half the resolution.
+
+    planes: that the chroma has; its rows are that much shorter, and so is their padding.
+    """
     _check_even(raster, height_too=True)
     h, w = raster.height, raster.width
     stride = _luma_stride(raster, tight=w * h * 3 // 2)
     if stride == raster.step:
-        _check_buffer(raster, w, full=stride * h * 3 // 2, last_padding=stride - w)
-    y = _plane(raster, 0, h, w, stride)
-    vu = _plane(raster, h * stride, h // 2, w, stride).reshape(h // 2, w // 2, 2)
-    vu = vu.repeat(2, axis=0).repeat(2, axis=1)
-    return _yuv_to_rgb(y, vu[..., 1], vu[..., 0])
+        padding = (stride - w) // planes
+        _check_buffer(raster, w, full=stride * h * 3 // 2, last_padding=padding)
+    return _plane(raster, 0, h, w, stride), stride
+
+
+def _decode_nv(raster: Raster, u: int) -> np.ndarray:
+    """Y plane, then pairs at half the resolution both ways, in rows of the same step.
+
+    u: place of U in a pair.
+    """
+    y, stride = _luma_420(raster, planes=1)
+    h, w = raster.height, raster.width
+    pairs = _plane(raster, h * stride, h // 2, w, stride).reshape(h // 2, w // 2, 2)
+    pairs = pairs.repeat(2, axis=0).repeat(2, axis=1)
+    return _yuv_to_rgb(y, pairs[..., u], pairs[..., 1 - u])
+
+
+def _decode_planar(raster: Raster, u: int) -> np.ndarray:
+    """Y plane, then U and V planes at half the resolution both ways, in rows of half the step.
+
+    u: 0 when U comes before V, else 1.
+    """
+    if raster.step % 2:
+        raise MessageError(f"{raster.encoding} needs an even step, not {raster.step}")
+    y, stride = _luma_420(raster, planes=2)
+    h, w = raster.height, raster.width
+    size = stride // 2 * (h // 2)
+    first, second = (
+        _plane(raster, h * stride + start, h // 2, w // 2, stride // 2)
+        .repeat(2, axis=0)
+        .repeat(2, axis=1)
+        for start in (0, size)
+    )
+    return _yuv_to_rgb(y, second if u else first, first if u else second)
 
 
 def _decode_nv24(raster: Raster) -> np.ndarray:
@@ -206,7 +238,11 @@ def _decoders() -> dict[str, Callable[[Raster], np.ndarray]]:
         table[name] = partial(_decode_yuv422, luma=1, chroma=0)
     for name in ("yuyv", "yuv422_yuy2"):
         table[name] = partial(_decode_yuv422, luma=0, chroma=1)
-    table.update({"nv21": _decode_nv21, "nv24": _decode_nv24, "32FC1": _decode_float})
+    for name, u in (("nv12", 0), ("nv21", 1)):
+        table[name] = partial(_decode_nv, u=u)
+    for name, u in (("i420", 0), ("yuv420", 0), ("yv12", 1)):
+        table[name] = partial(_decode_planar, u=u)
+    table.update({"nv24": _decode_nv24, "32FC1": _decode_float})
     return table
 
 

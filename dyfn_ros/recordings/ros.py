@@ -23,6 +23,7 @@ from dyfn_ros.recordings.ground_truth import GroundTruth
 from dyfn_ros.recordings.storage.base import Recorded, Storage
 from dyfn_ros.recordings.topics import Topics, topic_remarks
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
+from dyfn_ros.recordings.video_topic import VideoTopic, is_video
 
 
 class BagRecording:
@@ -134,13 +135,23 @@ class BagRecording:
         sources = {topics.image: topics.camera_info, topics.depth: topics.depth_info}
         infos: dict[str, Recorded] = {}
         wanted = {topic for pair in sources.items() for topic in pair if topic}
-        for recorded in self._storage.messages(wanted):
+        for recorded in self._messages(wanted):
             if recorded.topic not in sources:
                 infos[recorded.topic] = recorded
                 continue
             stamped = self._stamped(recorded)
             if stamped is not None:
                 yield replace(stamped, info=infos.get(sources[recorded.topic] or ""))
+
+    def _messages(self, wanted: set[str]) -> Iterator[Recorded]:
+        """Those of the storage; of compressed video its pictures."""
+        if not is_video(self._first(self.topics.image)):
+            yield from self._storage.messages(wanted)
+            return
+        video = VideoTopic(self.topics.image, lambda reason: self.notes.losses.update([reason]))
+        for recorded in self._storage.messages(wanted):
+            yield from video.take(recorded)
+        yield from video.rest()
 
     def _stamped(self, recorded: Recorded) -> Stamped | None:
         try:

@@ -11,12 +11,20 @@ from typing import Any
 from dyfn_ros.messages.compressed_depth import is_compressed_depth
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.storage.base import Storage
-from dyfn_ros.recordings.typestore import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
+from dyfn_ros.recordings.typestore import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    COMPRESSED_VIDEO,
+    FFMPEG_PACKET,
+    IMAGE,
+    POINT_CLOUD,
+)
 
 NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}
+PICTURES = (IMAGE, COMPRESSED_IMAGE, COMPRESSED_VIDEO, FFMPEG_PACKET)
 TRIES = 16  # messages of a topic, to see what it holds
-TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
+TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg)$")
 # Names in lower case. A device that is called after its depth says nothing about its topics.
 _DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$)")
 _OF_DEPTH = re.compile(r"depth|disparity")
@@ -60,16 +68,15 @@ def choose_topics(
     """
     kinds = _kinds(storage)
     colours, depths = _classify(storage, kinds)
-    images = {IMAGE, COMPRESSED_IMAGE}
     visible = [name for name in colours if not _OTHER_LIGHT.search(name.lower())] or colours
-    chosen = _named(path, kinds, image, images) or _only(path, kinds, visible, "image")
+    chosen = _named(path, kinds, image, set(PICTURES)) or _only(path, kinds, visible, "image")
     if chosen is None:
         raise _no_image(path, storage, kinds)
     truth = _optional(
         path,
         kinds,
         depth,
-        {*images, POINT_CLOUD},
+        {IMAGE, COMPRESSED_IMAGE, POINT_CLOUD},
         _nearest([d for d in depths if d != chosen], chosen),
     )
     info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
@@ -95,7 +102,7 @@ def _kinds(storage: Storage) -> dict[str, str]:
 
 def _no_image(path: Path, storage: Storage, kinds: dict[str, str]) -> RecordingError:
     text = f"no colour image topic; it holds {_listing(kinds, kinds)}"
-    pictures = [name for name, kind in kinds.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+    pictures = [name for name, kind in kinds.items() if kind in PICTURES]
     if pictures:
         text += "; --image-topic takes one that is taken for depth or a picture of depth"
     return RecordingError("; ".join([f"{path}: {text}", *_empty(storage)]))
@@ -106,7 +113,7 @@ def _empty(storage: Storage) -> list[str]:
     names = {
         name: topic.kind
         for name, topic in storage.topics.items()
-        if not topic.count and topic.kind in (IMAGE, COMPRESSED_IMAGE, CAMERA_INFO)
+        if not topic.count and topic.kind in (*PICTURES, CAMERA_INFO)
     }
     if not names:
         return []
@@ -123,7 +130,7 @@ def _fuller_twins(storage: Storage, used: list[str | None]) -> list[str]:
         count = storage.topics[name].count
         for twin, topic in storage.topics.items():
             same = TRANSPORTS.sub("", twin) == TRANSPORTS.sub("", name)
-            if same and topic.kind in (IMAGE, COMPRESSED_IMAGE) and topic.count > count:
+            if same and topic.kind in PICTURES and topic.count > count:
                 found.append(f"{name} holds {count} messages, {twin} {topic.count}")
     return found
 
@@ -185,7 +192,7 @@ def _named(path: Path, kinds: dict[str, str], name: str | None, types: set[str])
     """The topic a user named; the base name of a compressed topic will do."""
     if name is None:
         return None
-    for known in (name, f"{name}/compressed", f"{name}/compressedDepth"):
+    for known in (name, f"{name}/compressed", f"{name}/compressedDepth", f"{name}/ffmpeg"):
         if kinds.get(known) in types:
             return known
     expected = " or ".join(sorted(types))
@@ -216,7 +223,7 @@ def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[
     colours: list[str] = []
     depths: list[str] = []
     for name, kind in sorted(kinds.items()):
-        if kind not in (IMAGE, COMPRESSED_IMAGE):
+        if kind not in PICTURES:
             continue
         message = _first(storage, name)
         if message is None:
@@ -232,6 +239,8 @@ def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[
 def _is_depth(name: str, kind: str, message: Any) -> bool:
     if kind == COMPRESSED_IMAGE:
         return is_compressed_depth(message)
+    if kind != IMAGE:
+        return False
     named = message.encoding == "mono16" and "depth" in name.lower()
     return message.encoding in DEPTH_ENCODINGS or named
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 IMAGE = "sensor_msgs/msg/Image"
@@ -17,6 +17,16 @@ POSE = "geometry_msgs/msg/PoseStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF = "tf2_msgs/msg/TFMessage"
 FLOAT = "std_msgs/msg/Float64"
+COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
+FFMPEG_PACKET = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+_OTHERS = {  # fields of messages that are not of ROS itself
+    COMPRESSED_VIDEO: "builtin_interfaces/Time timestamp, string frame_id, uint8[] data, "
+    "string format",
+    FFMPEG_PACKET: "std_msgs/Header header, int32 width, int32 height, string encoding, "
+    "uint64 pts, uint8 flags, bool is_bigendian, uint8[] data",
+}
+for _kind, _fields in _OTHERS.items():
+    TYPES.register(get_types_from_msg(_fields.replace(", ", "\n"), _kind))
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,12 @@ def raw_message(
 def compressed_message(data: np.ndarray, layout: str, stamp_ns: int, frame_id: str) -> Any:
     """A CompressedImage of encoded bytes (1-D uint8)."""
     return _new(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=layout, data=data)
+
+
+def video_message(data: np.ndarray, layout: str, stamp_ns: int, frame_id: str) -> Any:
+    """A CompressedVideo of one encoded picture (1-D uint8)."""
+    stamp = header(stamp_ns, frame_id).stamp
+    return _new(COMPRESSED_VIDEO, timestamp=stamp, frame_id=frame_id, data=data, format=layout)
 
 
 def pose_message(pose: np.ndarray, stamp_ns: int, frame_id: str) -> Any:

@@ -15,16 +15,19 @@ from dyfn_ros.recordings.storage.base import DAMAGE, plain, reason, ros_type
 from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    COMPRESSED_VIDEO,
     IMAGE,
     TYPES,
     calibration_message,
     compressed_message,
     header,
     raw_message,
+    video_message,
 )
 
 FOXGLOVE = {
     "foxglove.CompressedImage": COMPRESSED_IMAGE,
+    "foxglove.CompressedVideo": COMPRESSED_VIDEO,
     "foxglove.RawImage": IMAGE,
     "foxglove.CameraCalibration": CAMERA_INFO,
 }
@@ -46,7 +49,7 @@ class Form:
 
 
 def message_form(encoding: str, schema: Schema | None) -> Form:
-    """cdr and ros1 of any type, json and protobuf of Foxglove's images and calibration."""
+    """cdr and ros1 of any type, json and protobuf of Foxglove's images, video and calibration."""
     name = "" if schema is None else schema.name
     if encoding == "cdr":
         return Form(encoding, ros_type(name), plain)
@@ -107,6 +110,9 @@ def _cdr(kind: str, fields: Mapping[str, Any]) -> bytes:
         data = np.frombuffer(fields["data"], np.uint8)
         message = compressed_message(data, str(fields["format"]), 0, "")
         message.header = head
+    elif kind == COMPRESSED_VIDEO:
+        data, stamp = np.frombuffer(fields["data"], np.uint8), int(fields["stamp_ns"])
+        message = video_message(data, str(fields["format"]), stamp, str(fields["frame_id"]))
     else:
         message = raw_message(
             head,

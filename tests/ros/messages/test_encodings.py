@@ -129,21 +129,52 @@ def test_yuv422_colours_in_both_byte_orders(encoding: str, colour: str) -> None:
 
 
 def planar(encoding: str, colours: list[list[str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Y and interleaved chroma planes; nv21 has V before U and one pair per 2 x 2 pixels."""
+    """Y and interleaved chroma planes; all but nv24 have one pair per 2 x 2 pixels."""
     yuv = np.array([[YUV[name] for name in row] for row in colours], np.uint8)
     if encoding == "nv24":
         return yuv[..., 0], yuv[..., 1:].reshape(len(yuv), -1)
-    return yuv[..., 0], yuv[::2, ::2, :0:-1].reshape(len(yuv) // 2, -1)
+    order = slice(None, 0, -1) if encoding in ("nv21", "yv12") else slice(1, None)
+    return yuv[..., 0], yuv[::2, ::2, order].reshape(len(yuv) // 2, -1)
 
 
 @pytest.mark.parametrize("padding", [0, 1, 5])
-def test_nv21_shares_chroma_between_four_pixels(padding: int) -> None:
+@pytest.mark.parametrize("encoding", ["nv21", "nv12"])
+def test_chroma_pairs_are_shared_between_four_pixels(padding: int, encoding: str) -> None:
     colours = [["red"] * 2 + ["blue"] * 2] * 2 + [["green"] * 2 + ["grey"] * 2] * 2
-    y, chroma = planar("nv21", colours)
+    y, chroma = planar(encoding, colours)
     data = np.pad(np.vstack([y, chroma]), ((0, 0), (0, padding)), constant_values=77)
-    rgb = decode_colour(raster(data.tobytes(), 4, 4, "nv21", 4 + padding)).astype(int)
+    rgb = decode_colour(raster(data.tobytes(), 4, 4, encoding, 4 + padding)).astype(int)
     expected = np.array([[RGB[name] for name in row] for row in colours])
     assert np.abs(rgb - expected).max() <= 2
+
+
+@pytest.mark.parametrize("padding", [0, 2, 6])
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("encoding", ["i420", "yuv420", "yv12"])
+def test_chroma_planes_are_shared_between_four_pixels(
+    padding: int, cut: bool, encoding: str
+) -> None:
+    """cut: without the padding of the last row."""
+    colours = [["red"] * 2 + ["blue"] * 2] * 2 + [["green"] * 2 + ["grey"] * 2] * 2
+    y, chroma = planar(encoding, colours)
+    pairs = chroma.reshape(2, 2, 2)
+    planes = [np.pad(y, ((0, 0), (0, padding)), constant_values=77)]
+    for kind in range(2):
+        plane = np.pad(pairs[..., kind], ((0, 0), (0, padding // 2)), constant_values=77)
+        planes.append(plane)
+    data = b"".join(plane.tobytes() for plane in planes)
+    data = data[: len(data) - padding // 2] if cut else data
+    rgb = decode_colour(raster(data, 4, 4, encoding, 4 + padding)).astype(int)
+    expected = np.array([[RGB[name] for name in row] for row in colours])
+    assert np.abs(rgb - expected).max() <= 2
+    if padding:
+        with pytest.raises(MessageError, match="make"):
+            decode_colour(raster(data[:-1] if cut else data[:-2], 4, 4, encoding, 4 + padding))
+
+
+def test_an_odd_step_of_chroma_planes_is_refused() -> None:
+    with pytest.raises(MessageError, match="even step, not 5"):
+        decode_colour(raster(bytes(15), 2, 4, "i420", 5))
 
 
 @pytest.mark.parametrize("padding", [0, 1, 5])
@@ -158,7 +189,7 @@ def test_nv24_has_chroma_of_its_own_for_each_pixel(padding: int) -> None:
     assert np.abs(rgb - expected).max() <= 2
 
 
-@pytest.mark.parametrize(("encoding", "step"), [("nv21", 6), ("nv24", 12)])
+@pytest.mark.parametrize(("encoding", "step"), [("nv21", 6), ("nv12", 6), ("nv24", 12)])
 def test_planar_step_may_count_all_planes(encoding: str, step: int) -> None:
     colours = [["red", "red", "blue", "blue"]] * 2
     y, chroma = planar(encoding, colours)
@@ -167,7 +198,7 @@ def test_planar_step_may_count_all_planes(encoding: str, step: int) -> None:
     assert np.array_equal(decode_colour(raster(data, 2, 4, encoding, step)), one)
 
 
-@pytest.mark.parametrize("encoding", ["uyvy", "yuyv", "nv21"])
+@pytest.mark.parametrize("encoding", ["uyvy", "yuyv", "nv21", "nv12", "i420"])
 def test_odd_width_of_shared_chroma_is_refused(encoding: str) -> None:
     with pytest.raises(MessageError, match="even width"):
         decode_colour(raster(bytes(100), 2, 3, encoding, 6))
@@ -196,9 +227,13 @@ def test_data_of_another_length_is_refused(size: int) -> None:
         decode_colour(raster(bytes(size), 2, 2, "rgb8", 6))
 
 
+PLANAR = ("i420", "yuv420", "yv12")
+SHARED_420 = ("nv12", "nv21", *PLANAR)
+
+
 def tight_size(encoding: str, height: int, width: int) -> tuple[int, int]:
     """Bytes of a row that step describes, and rows (in such rows) of the whole buffer times 2."""
-    if encoding == "nv21":
+    if encoding in SHARED_420:
         return width, 3 * height
     if encoding == "nv24":
         return width, 6 * height
@@ -222,9 +257,11 @@ def test_padding_never_changes_or_shears_the_picture(
     encoding: str, height: int, width: int, padding: int, seed: int, big: bool
 ) -> None:
     row, rows = tight_size(encoding, height, width)
-    if encoding in ("nv21", "uyvy", "yuyv", "yuv422", "yuv422_yuy2") and (width % 2 or height % 2):
+    shared = (*SHARED_420, "uyvy", "yuyv", "yuv422", "yuv422_yuy2")
+    if encoding in shared and (width % 2 or height % 2):
         width, height = 2 * width, 2 * height
         row, rows = tight_size(encoding, height, width)
+    padding *= 2 if encoding in PLANAR else 1
     if encoding.startswith("bayer"):
         width, height = width + 1, height + 1
         row, rows = tight_size(encoding, height, width)
@@ -244,16 +281,20 @@ def test_padding_never_changes_or_shears_the_picture(
 def pad_rows(
     encoding: str, plain: np.ndarray, height: int, row: int, padding: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Random bytes after each row; twice as many after the double rows of nv24's chroma."""
+    """Random bytes after each row; twice as many after the double rows of nv24's chroma, half as
+    many after the half rows of planes."""
 
     def padded(plane: np.ndarray, length: int, extra: int) -> np.ndarray:
         plane = plane.reshape(-1, length)
         junk = rng.integers(0, 256, (len(plane), extra)).astype(np.uint8)
         return np.hstack([plane, junk]).reshape(-1)
 
+    luma, chroma = plain[: height * row], plain[height * row :]
+    if encoding in PLANAR:
+        halves = padded(chroma, row // 2, padding // 2)
+        return np.concatenate([padded(luma, row, padding), halves])
     if encoding != "nv24":
         return padded(plain, row, padding)
-    luma, chroma = plain[: height * row], plain[height * row :]
     return np.concatenate([padded(luma, row, padding), padded(chroma, 2 * row, 2 * padding)])
 
 

@@ -250,7 +250,8 @@ def protobuf_class(kind: str) -> tuple[Any, bytes]:
     ("encoding", "name", "said"),
     [
         ("protobuf", "foxglove.CompressedImage", r"whose schema cannot be used"),
-        ("protobuf", "foxglove.CompressedVideo", r"encoded as protobuf, which is not read"),
+        ("protobuf", "foxglove.CompressedVideo", r"whose schema cannot be used"),
+        ("protobuf", "foxglove.SceneUpdate", r"encoded as protobuf, which is not read"),
         ("json", "sensor_msgs/Image", r"encoded as json, which is not read"),
         ("flatbuffer", "foxglove.RawImage", r"encoded as flatbuffer, which is not read"),
     ],
