@@ -12,7 +12,6 @@ import numpy as np
 from dyfn_core.evaluation.report.frame_grid import FrameStrip, ShownFrames
 from dyfn_core.evaluation.report.html import Cell, Table
 from dyfn_core.evaluation.report.pictures import curves
-from dyfn_core.evaluation.report.variants import over_median
 from dyfn_core.evaluation.report.worst_frames import WorstFrames
 from dyfn_core.prediction import DEPTH
 from dyfn_core.scoring.frame_scores import FrameScore, MetricRows
@@ -20,8 +19,10 @@ from dyfn_core.scoring.protocols import (
     CONTROLS,
     SequenceScore,
     SequenceScorer,
+    drift,
     spread,
     to_shape,
+    video_column,
 )
 from dyfn_core.scoring.variants import VariantScorers
 
@@ -35,6 +36,7 @@ COLUMNS = (
     "image_delta1",
     "video_abs_rel",
     "video_delta1",
+    "video_ratio",
     "scale",
     "shift",
 )
@@ -186,6 +188,7 @@ class SequenceEvaluation:
             "latency_ms": self.latency_ms(),
             "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
             "coverage": _coverage(scorer),
+            "drift": drift(video),
             "spread": spread(scorer.frames),
             "controls": {
                 name: {"image": _means(control.image()), "video": _means(control.video())}
@@ -213,7 +216,7 @@ class SequenceEvaluation:
         if name == "latency_ms":
             return np.array(self._latencies) * 1000
         if protocol == "video":
-            return np.full(self.frames, np.nan) if video is None else video.frames.column(metric)
+            return video_column(video, metric, self.frames)
         if protocol == "image":
             return scores.metrics.column(metric)
         if protocol == "metric":
@@ -269,14 +272,14 @@ def score_table(results: Mapping[str, dict[str, Any]]) -> Table:
     scores = [text for name in protocols for text in (f"{name} AbsRel", "delta1")]
     rows: list[list[Cell]] = []
     for name, result in results.items():
-        wandering = (result["spread"] or {}).get("log_scale_std")
+        wandering = (result["drift"] or {}).get("log_std")
         latency = result["latency_ms"] or {}
         p50 = latency.get("p50")
         rows.append([name, *_scores(result, protocols), wandering, _one_digit(p50)])
     controls = {f"control: {n}": c for n, c in next(iter(results.values()))["controls"].items()}
     scored = {name: _scores(control, protocols) for name, control in controls.items()}
     rows += [[n, *s, None, None] for n, s in scored.items() if s != [None] * len(s)]
-    header = ("", *scores, "scale spread", "p50 ms")
+    header = ("", *scores, "drift", "p50 ms")
     kept = [i for i in range(len(header)) if any(row[i] is not None for row in rows)]
     return Table([header[i] for i in kept], [[row[i] for i in kept] for row in rows], [*scored])
 
@@ -291,11 +294,11 @@ def _scores(result: Mapping[str, Any], protocols: Sequence[str]) -> list[Cell]:
 
 
 def curve_picture(runs: Mapping[str, SequenceEvaluation]) -> np.ndarray:
-    """Per-frame scale (over its median) and error over time, a line per run."""
+    """Each frame's true depth over the predicted one and its error over time, a line per run."""
     return curves(
         {
-            "scale that fits each frame, over its median (flat is stable)": {
-                name: over_median(run.column("scale")) for name, run in runs.items()
+            "true over predicted depth, one alignment for the sequence (1: no drift)": {
+                name: run.column("video_ratio") for name, run in runs.items()
             },
             "AbsRel, one alignment for the sequence (video protocol)": {
                 name: run.column("video_abs_rel") for name, run in runs.items()

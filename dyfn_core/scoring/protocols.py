@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -27,12 +28,16 @@ class SequenceScore:
 
     scale, shift: the one alignment of the video protocol (1 and 0 for the metric protocol,
     medians over frames for the image protocol). frames: each frame's metrics, None if unscored.
+    ratios: each frame's true over aligned depth (median over its samples), NaN if unscored; under
+    one alignment for the sequence it is how much nearer or farther that frame should have been.
+    Empty for the image protocol.
     """
 
     metrics: dict[str, float]
     scale: float
     shift: float
     frames: MetricRows
+    ratios: Sequence[float] = ()
 
 
 class SequenceScorer:
@@ -124,12 +129,20 @@ class SequenceScorer:
         return fit_scale_shift(prediction, wanted, 1 / wanted)
 
     def _aligned(self, scale: float, shift: float) -> SequenceScore:
-        rows = MetricRows()
+        rows, ratios = MetricRows(), array("d")
         for p, d in self._kept:
-            rows.append(self._score(p, d, scale, shift) if p.size >= MIN_PIXELS else None)
+            scored = p.size >= MIN_PIXELS
+            rows.append(self._score(p, d, scale, shift) if scored else None)
+            ratios.append(self._ratio(p, d, scale, shift) if scored else math.nan)
         means = rows.means()
         assert means is not None, "only of samples that are scorable"
-        return SequenceScore(means, scale, shift, rows)
+        return SequenceScore(means, scale, shift, rows, ratios)
+
+    def _ratio(
+        self, prediction: np.ndarray, target: np.ndarray, scale: float, shift: float
+    ) -> float:
+        aligned = align_depth(prediction, scale, shift, self.quantity)
+        return float(np.median(target / np.maximum(aligned, MIN_DEPTH)))
 
     def _score(
         self, prediction: np.ndarray, target: np.ndarray, scale: float, shift: float
@@ -245,3 +258,26 @@ def spread(frames: Sequence[FrameScore]) -> dict[str, float] | None:
         "shift_std": float(np.std([t for _, t in fits])),
         "not_positive": len(fits) - log_scale.size,
     }
+
+
+def video_column(video: SequenceScore | None, name: str, frames: int) -> np.ndarray:
+    """A column of the video protocol, one of METRICS or "ratio"; all NaN without scores."""
+    if video is None:
+        return np.full(frames, np.nan)
+    return np.array(video.ratios) if name == "ratio" else video.frames.column(name)
+
+
+def drift(video: SequenceScore | None) -> dict[str, float] | None:
+    """How far the scale wanders over a sequence under its one alignment; None under two frames.
+
+    log_std: standard deviation of the log of SequenceScore.ratios; max_step: the largest change of
+    that log from one scored frame to the next.
+    """
+    if video is None:
+        return None
+    ratios = np.asarray(video.ratios)
+    log_ratios = np.log(ratios[np.isfinite(ratios)])
+    if log_ratios.size < 2:
+        return None
+    steps = np.abs(np.diff(log_ratios))
+    return {"log_std": float(np.std(log_ratios)), "max_step": float(steps.max())}

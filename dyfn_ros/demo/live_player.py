@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -20,6 +21,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_srvs.srv import Trigger
 
 from dyfn_ros.demo.node_process import LiveError, NodeProcess
+from dyfn_ros.demo.odometry import RecordedOdometry
 from dyfn_ros.messages.clouds import cloud_points
 from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.recordings.open import RecordedFrame
@@ -28,9 +30,10 @@ from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, TYPES
 OUTPUTS = {"depth/image": Image, "depth/camera_info": CameraInfo, "points": PointCloud2}
 START_PATIENCE = 180.0  # seconds for imports and loading the model, on a busy machine
 FRAME_PATIENCE = 60.0
-PRIME_INTERVAL = 0.5
+PRIME_INTERVAL, SLOWER = 0.5, 1.4
 ASK_INTERVAL = 10.0  # DDS loses an answer to a client whose endpoints are not all known yet
 RELIABLE = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+POSES = QoSProfile(depth=200, reliability=ReliabilityPolicy.RELIABLE)
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,18 @@ class LivePlayer:
     """Publishes a frame, waits for all of its outputs, publishes the next.
 
     process: the node, watched while waiting. image_kind: message type of the frames' sources.
-    namespace: the node's; "" for none.
+    namespace: the node's; "" for none. odometry: published beside the images, for a node whose
+    metric_source it is.
     A context manager. Raises NodeExitError when the node ends, LiveError when it does not answer.
     """
 
     def __init__(
-        self, process: NodeProcess, image_kind: str, domain: int, namespace: str = ""
+        self,
+        process: NodeProcess,
+        image_kind: str,
+        domain: int,
+        namespace: str = "",
+        odometry: RecordedOdometry | None = None,
     ) -> None:
         self._process = process
         self._name = f"{namespace}/stream_depth"
@@ -74,6 +83,9 @@ class LivePlayer:
         kind, topic = (CompressedImage, "image/compressed") if compressed else (Image, "image")
         self._images = self._node.create_publisher(kind, topic, RELIABLE)
         self._infos = self._node.create_publisher(CameraInfo, "camera_info", RELIABLE)
+        self._odometry, self._poses = odometry, []
+        if odometry is not None:
+            self._poses = [self._node.create_publisher(Odometry, "odometry", POSES)]
         self._subscriptions = [self._subscribe(name) for name in OUTPUTS]
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -94,14 +106,16 @@ class LivePlayer:
 
         They are stamped 1, 2, 3 ... nanoseconds; reset() afterwards.
         """
-        deadline = time.monotonic() + START_PATIENCE
+        deadline, interval = time.monotonic() + START_PATIENCE, PRIME_INTERVAL
         while time.monotonic() < deadline:
             self._primes += 1
             message = frame.source.message()
             message.header.stamp.sec, message.header.stamp.nanosec = 0, self._primes
             data = bytes(TYPES.serialize_cdr(message, frame.source.kind))
             self._publish(frame, data, self._primes)
-            if self._wait(lambda: self._complete(self._primes), PRIME_INTERVAL):
+            whole = self._wait(lambda: self._complete(self._primes), interval)
+            interval *= SLOWER  # or a node that is slower than this would never catch up
+            if whole and all(poses.get_subscription_count() for poses in self._poses):
                 with self._changed:
                     self._arrived.clear()
                 return
@@ -121,7 +135,10 @@ class LivePlayer:
     def play(self, frames: Iterable[RecordedFrame]) -> Iterator[LiveResult]:
         """Results in order; the caller's work on one overlaps the node's work on the next."""
         ready: LiveResult | None = None
+        feed = None if self._odometry is None else self._odometry.feed()
         for frame in frames:
+            for data in () if feed is None else feed.until(frame.stamp_ns):
+                self._poses[0].publish(data)
             sent = self._publish(frame, frame.source.data, frame.stamp_ns)
             if ready is not None:
                 yield ready

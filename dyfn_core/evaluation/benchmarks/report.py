@@ -105,7 +105,7 @@ def _variants(results: dict[str, Any]) -> list[Variant]:
     alone = all(role(name) != "result" for name in names)
     found = []
     for name, scores in names.items():
-        shown = {key: scores[key] for key in ("video", "spread")}
+        shown = {key: scores[key] for key in ("video", "drift")}
         kind = "result" if alone and role(name) == "base" else role(name)
         found.append(Variant(name, kind, {**shown, "frames": results["frames"]}))
     return found

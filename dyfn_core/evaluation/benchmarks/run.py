@@ -17,7 +17,15 @@ from dyfn_core.evaluation.benchmarks.predictions import Method, Predict
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkFrame, BenchmarkSequence, Opened
 from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
 from dyfn_core.scoring.plausibility import Plausibility
-from dyfn_core.scoring.protocols import CONTROLS, L1, SequenceScore, SequenceScorer, spread
+from dyfn_core.scoring.protocols import (
+    CONTROLS,
+    L1,
+    SequenceScore,
+    SequenceScorer,
+    drift,
+    spread,
+    video_column,
+)
 from dyfn_core.scoring.variants import VariantScorers
 
 PROTOCOLS = ("image", "video", "metric")
@@ -137,18 +145,17 @@ def _summary(scorer: SequenceScorer) -> dict[str, Any]:
         "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
         "coverage": float(np.mean(scored)) if scored else None,
         "scored_frames": len(scored),
+        "drift": drift(video),
         "spread": spread(scorer.frames),
     }
 
 
 def _over_time(scorer: SequenceScorer) -> dict[str, list[float | None]]:
-    """scale and shift of each frame, and its AbsRel under the video protocol; None: unscored."""
+    """scale and shift of each frame, its AbsRel and ratio under the video protocol."""
     columns = {name: scorer.frames.column(name) for name in ("scale", "shift")}
-    video = scorer.video()
-    errors = (
-        np.full(len(scorer.frames), np.nan) if video is None else video.frames.column("abs_rel")
-    )
-    columns["video_abs_rel"] = errors
+    video, frames = scorer.video(), len(scorer.frames)
+    for name in ("abs_rel", "ratio"):
+        columns[f"video_{name}"] = video_column(video, name, frames)
     return {
         name: [None if np.isnan(value) else float(value) for value in values]
         for name, values in columns.items()

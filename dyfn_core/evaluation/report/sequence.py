@@ -38,7 +38,7 @@ FRAMES_NOTE = (
     "One alignment (scale and shift) to the truth for all frames of a run, so that drift shows."
 )
 UNALIGNED_NOTE = "Without ground truth a depth has no unit: red is near, blue is far."
-COLUMNS = ("scale", "shift", "video_abs_rel", "image_abs_rel", "metric_abs_rel")
+COLUMNS = ("video_ratio", "shift", "video_abs_rel", "image_abs_rel", "metric_abs_rel")
 
 
 def sequence_sections(
@@ -115,7 +115,7 @@ def _controls(scorers: Mapping[str, SequenceScorer]) -> Iterator[Variant]:
         video = scorer.video()
         if video is not None:
             columns = {
-                "scale": scorer.frames.column("scale"),
+                "video_ratio": np.array(video.ratios),
                 "video_abs_rel": video.frames.column("abs_rel"),
                 "image_abs_rel": scorer.frames.metrics.column("abs_rel"),
             }

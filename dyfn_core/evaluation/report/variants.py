@@ -27,7 +27,7 @@ class Variant:
         name: As tables and curves call it.
         role: "result": what the report is about, the first of them most; "base": what results are
             compared with, at most one; "control": knows nothing or little, drawn grey.
-        scores: As SequenceEvaluation.results(); protocols, spread and latency_ms may be missing.
+        scores: As SequenceEvaluation.results(); protocols, drift and latency_ms may be missing.
         columns: Column of SequenceEvaluation -> a value per frame, NaN where there is none.
     """
 
@@ -38,8 +38,8 @@ class Variant:
 
     @property
     def drift(self) -> float | None:
-        """Standard deviation of the log of each frame's own scale; None under two frames."""
-        return _number(self.scores, "spread", "log_scale_std")
+        """Standard deviation of the log of true over aligned depth; None under two frames."""
+        return _number(self.scores, "drift", "log_std")
 
     @property
     def abs_rel(self) -> float | None:
@@ -178,7 +178,7 @@ def over_time(variants: Sequence[Variant], stamps: np.ndarray | None = None) -> 
         stamps: Seconds of each frame; None, or stamps that fall: frames are counted.
 
     Returns:
-        Scale (over its median), errors and shift; nothing where no frame has truth.
+        True over predicted depth, errors and shift; nothing where no frame has truth.
     """
     x, label = seconds_axis(stamps)
     muted = {v.name for v in variants if v.role == "control"}
@@ -187,12 +187,14 @@ def over_time(variants: Sequence[Variant], stamps: np.ndarray | None = None) -> 
     def curves(title: str, unit: str, column: str) -> list[Part]:
         known = {v.name: v.columns[column] for v in variants if column in v.columns}
         lines = {name: values for name, values in known.items() if np.isfinite(values).any()}
-        if column == "scale":
-            lines = {name: over_median(values) for name, values in lines.items()}
         return [Curves(title, lines, label, unit, x, muted)] if lines else []
 
     return [
-        *curves("Scale that fits each frame best (flat: no drift)", "times its median", "scale"),
+        *curves(
+            "True over predicted depth, one alignment for the sequence (1: no drift)",
+            "times",
+            "video_ratio",
+        ),
         *curves(
             "Error, one alignment for the sequence (video)",
             "AbsRel (share of the true depth)",

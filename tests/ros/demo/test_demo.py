@@ -37,7 +37,7 @@ def test_live_is_scored_and_equals_the_replay_byte_for_byte(
     assert play(tmp_path / "walk", tmp_path / "out", TINY_NODE) == OK
     runs = json.loads((tmp_path / "out" / "metrics.json").read_text())["runs"]
     resets = 2  # before each run
-    for name, option in (("with DyFN", []), ("without (base model)", ["--no-stabilize"])):
+    for name, option in (("DyFN", []), ("base", ["--no-stabilize"])):
         offline = [str(tmp_path / "walk"), "--out", str(tmp_path / "offline"), "--model", "tiny"]
         assert replay.main([*offline, *option], load_tiny) == OK
         expected = json.loads((tmp_path / "offline" / "metrics.json").read_text())
