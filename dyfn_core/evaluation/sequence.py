@@ -182,6 +182,7 @@ class SequenceEvaluation:
         video, metric = self.video(), self.metric()
         return {
             "frames": self.frames,
+            "scored_frames": self.scored_frames,
             "image": _means(scorer.image()),
             "video": _means(video),
             **({} if metric is None else {"metric": metric.means()}),

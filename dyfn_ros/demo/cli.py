@@ -118,7 +118,8 @@ def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[st
     """Play the recording once per run through a live node and write the report.
 
     With odometry that run is the first, and frames for which it has no depth yet (metres are
-    withheld until they are known) are scored in no run.
+    withheld until they are known) are scored in no run; where it has none at all, it alone is not
+    scored.
 
     Raises RecordingError (the recording), LiveError (the node), ImportError (no ROS).
     """
@@ -135,7 +136,8 @@ def demo(options: DemoOptions, command: Sequence[str] = NODE_COMMAND) -> dict[st
     runs: dict[str, DemoRun] = {}
     if odometry is not None:
         runs |= stage.play({MOVING: True}, odometry)
-    runs |= stage.play({DYFN: True, BASE: False}, scored=runs[MOVING].answered if runs else None)
+    scored = (runs[MOVING].answered or None) if runs else None
+    runs |= stage.play({DYFN: True, BASE: False}, scored=scored)
     notes = [] if odometry is not None else [f"two runs only: {why}"]
     _write(options, recording, runs, notes)
     return runs
@@ -167,6 +169,7 @@ class _Stage:
         parameters = {
             "model": options.model,
             "drop_frames": False,
+            "reliability": "reliable",  # from the first frame on
             "wait_for_camera_info": self.first.info is not None,
             "image_transport": "compressed" if kind == COMPRESSED_IMAGE else "raw",
         }
@@ -276,7 +279,7 @@ def _withheld(runs: dict[str, DemoRun]) -> list[str]:
     evaluation, answered = runs[MOVING].evaluation, runs[MOVING].answered
     missing = evaluation.frames - len(answered)
     if not answered:
-        return [f"{MOVING} found no metres in {evaluation.frames} frames, so no run is scored"]
+        return [f"{MOVING} found no metres in {evaluation.frames} frames and is not scored"]
     stamps = evaluation.column("stamp")
     start = stamps[min(answered)] - stamps[0]
     return [

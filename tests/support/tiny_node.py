@@ -1,4 +1,4 @@
-"""stream_depth with the tiny model (or "pinhole", or "endless"), as a process of its own."""
+"""stream_depth with the tiny model (or "pinhole", "pinhole with DyFN", "endless"), a process of its own."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ def load(name: str, device: str) -> GeometryModel:
 
     for builder in ("depth_message", "cloud_message", "colour_message", "compressed_message"):
         report(builder)
-    return PinholeModel().eval() if name == "pinhole" else load_tiny(name, device)
+    if name in ("pinhole", "pinhole with DyFN"):
+        return PinholeModel(stabilized=name != "pinhole").eval()
+    return load_tiny(name, device)
 
 
 def report(name: str) -> None:

@@ -153,7 +153,7 @@ class LongRun(SequenceEvaluation):
         scale, shift, error = np.random.default_rng(0).lognormal(size=(3, LONG))
         errors = {"video_abs_rel": error, "image_abs_rel": error / 2, "metric_abs_rel": error * 3}
         times = {"latency_ms": 20 + scale, "stamp": np.arange(LONG) / 30}
-        return {"scale": scale, "shift": shift, **errors, **times}[name]
+        return {"video_ratio": scale, "shift": shift, **errors, **times}[name]
 
 
 def test_a_long_recording_has_a_small_report(tmp_path: Path) -> None:

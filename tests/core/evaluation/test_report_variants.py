@@ -30,7 +30,7 @@ def variant(
 ) -> Variant:
     scores = {
         "frames": 90,
-        "spread": None if drift is None else {"log_scale_std": drift},
+        "drift": None if drift is None else {"log_std": drift},
         "video": None if error is None else {"abs_rel": error, "delta1": 1 - error},
         **more,
     }
@@ -175,7 +175,7 @@ def test_a_third_variant_is_everywhere() -> None:
     ]
     assert [*grid.rows] == ["0.00 s", "0.50 s", "1.00 s"]  # type: ignore[union-attr]
     curves = {part.title: part for part in sections["Over time"]}  # type: ignore[union-attr]
-    scale = curves["Scale that fits each frame best (flat: no drift)"]
+    scale = curves["True over predicted depth, one alignment for the sequence (1: no drift)"]
     assert {*runs, "control: ramp"} <= {*scale.lines}  # type: ignore[union-attr]
     assert "Error in metres, no alignment" in curves
     with pytest.raises(ValueError, match="expected one of the runs after the first"):
@@ -187,7 +187,7 @@ def test_without_truth_there_are_no_dashes() -> None:
     table = score_table({name: run.results() for name, run in runs.items()})
     assert [*table.header] == ["", "p50 ms"]
     assert table.rows == [["a", "10.0"], ["b", "10.0"]]
-    assert over_time([Variant("a", "result", {}, {"scale": np.full(3, np.nan)})]) == []
+    assert over_time([Variant("a", "result", {}, {"video_ratio": np.full(3, np.nan)})]) == []
     titles = [s.title for s in sequence_sections(runs, base="b")]
     assert titles == ["At a glance", "Frames", "Latency"]
 

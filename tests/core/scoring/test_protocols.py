@@ -1,11 +1,14 @@
 """The image, video and metric protocols: what alignment forgives, and what it does not."""
 
+import math
+
 import numpy as np
 import pytest
 
 from dyfn_core.scoring.protocols import (
     SequenceScorer,
     constant,
+    drift,
     ramp,
     sample_grid,
     spread,
@@ -127,6 +130,33 @@ def test_the_ramp_explains_a_floor_and_the_constant_a_wall() -> None:
     scorer = SequenceScorer()
     assert scorer.push(ramp((24, 32)), floor).metrics["abs_rel"] < 1e-6  # type: ignore[index]
     assert scorer.push(constant((24, 32)), floor * 0 + 3).metrics["abs_rel"] < 1e-6  # type: ignore[index]
+
+
+@pytest.mark.parametrize("quantity", ["depth", "disparity"])
+def test_drift_is_that_of_true_over_aligned_depth(quantity: str) -> None:
+    """One alignment fits the frames that agree; a frame's own shift is no drift of its own."""
+    scorer = SequenceScorer(quantity=quantity)
+    for index, factor in enumerate([1, 1, 1, 1, 1.25, 0.8]):
+        depth = scene(index) * np.float32(factor)
+        scorer.push(depth if quantity == "depth" else 1 / depth, scene(index))
+    video = scorer.video()
+    assert video is not None
+    assert [*video.ratios] == pytest.approx([1, 1, 1, 1, 0.8, 1.25], rel=0.02)
+    found = drift(video)
+    assert found is not None
+    step = math.log(1.25)
+    assert found["log_std"] == pytest.approx(np.std([0] * 4 + [-step, step]), rel=0.05)
+    assert found["max_step"] == pytest.approx(2 * step, rel=0.05)
+    scorer.push(np.full_like(scene(0), np.nan), scene(0))
+    unscored = scorer.video()
+    assert unscored is not None and math.isnan(unscored.ratios[-1]) and drift(unscored) == found
+
+
+def test_drift_needs_two_scored_frames() -> None:
+    scorer = SequenceScorer()
+    assert drift(scorer.video()) is None
+    scorer.push(scene(0), scene(0))
+    assert drift(scorer.video()) is None
 
 
 def test_spread_measures_the_wandering_scale() -> None:

@@ -1,5 +1,6 @@
 """dyfn-demo: a live node in another process, over DDS, and no process left behind."""
 
+import html
 import json
 import os
 import re
@@ -8,12 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dyfn_ros.demo.cli import FAILED, OK, UNUSABLE, main
 from dyfn_ros.demo.node_process import LiveError, NodeExitError, NodeProcess
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
 from dyfn_ros.replay import cli as replay
+from tests.support.plane_drive import drive, plane_folder
 from tests.support.rgbd_frames import rgbd
 from tests.support.ros_graph import DEADLINE, own_domain
 from tests.support.tiny_model import load_tiny
@@ -53,6 +56,34 @@ def test_live_is_scored_and_equals_the_replay_byte_for_byte(
     assert page.count('class="frames"') == 2  # strip of both runs, worst frames of the first
     log = (tmp_path / "out" / "node.log").read_text()
     assert "0 dropped" in log and f"{resets} resets" in log
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag with odometry of the camera itself."""
+    path = tmp_path_factory.mktemp("plane")
+    folder = plane_folder(path / "folder")
+    return drive(folder, path / "walk.mcap", mount=np.eye(4), child="camera_optical")
+
+
+def test_a_recording_with_odometry_is_played_three_ways(
+    plane: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert play(plane, tmp_path, TINY_NODE, model="pinhole with DyFN") == OK
+    runs = json.loads((tmp_path / "metrics.json").read_text())["runs"]
+    assert list(runs) == ["base", "DyFN", "DyFN + odometry"]
+    assert all(run["frames"] == 60 for run in runs.values())
+    assert "metric" not in runs["base"] and "metric" not in runs["DyFN"]
+    assert runs["DyFN + odometry"]["metric"]["abs_rel"] < 0.1
+    text = capsys.readouterr().out
+    assert "DyFN + odometry is in metres: AbsRel 0.0" in text.splitlines()[0]
+    said = re.search(r"is in metres from (\d\.\d) s on; (\d+) of 60 frames", text)
+    assert said and 0 < int(said[2]) < 50
+    # What is compared is compared on the same frames.
+    assert {run["scored_frames"] for run in runs.values()} == {60 - int(said[2])}
+    page = (tmp_path / "report.html").read_text()
+    assert text.splitlines()[0] in html.unescape(page)
+    assert "0 dropped" in (tmp_path / "node_odometry.log").read_text()
 
 
 def test_a_node_that_cannot_start_is_a_clear_failure(

@@ -6,43 +6,19 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
-from dyfn_core.geometry.rigid import between, inverse
-from dyfn_ros.recordings.open import open_recording
-from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL, UNUSABLE
 from dyfn_ros.replay.run import ModelLoader
-from tests.support.odometry import MOUNT, SECOND, odometry, pose_text
-from tests.support.pinhole import FOV_X, PinholeModel
-from tests.support.textured_plane import CAMERA, SIZE, plane_view, texture, walk
-
-UNIT = 3.0  # metres in one unit of the model
-FOCAL = SIZE[1] / 2 / np.tan(np.radians(FOV_X / 2))
-OWN_CAMERA = np.array([[FOCAL, 0, CAMERA[0, 2]], [0, FOCAL, CAMERA[1, 2]], [0, 0, 1]])
+from tests.support.odometry import MOUNT, pose_text
+from tests.support.pinhole import PinholeModel
+from tests.support.plane_drive import UNIT, drive, plane_folder
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """60 frames at 10 Hz; red says the depth to PinholeModel, green has the texture."""
-    path, whole = tmp_path_factory.mktemp("plane"), texture()
-    for name in ("rgb", "depth"):
-        (path / name).mkdir()
-    np.savetxt(path / "K.txt", OWN_CAMERA)
-    poses = walk(60, step=0.02, turn=0.002)
-    np.savetxt(path / "poses.txt", np.stack(poses).reshape(-1, 16))
-    for index, pose in enumerate(poses):
-        view = plane_view(pose, whole, OWN_CAMERA)
-        image = np.zeros((*SIZE, 3), np.uint8)
-        image[..., 2] = np.round((view.depth / UNIT - 0.5) * 255)
-        image[..., 1] = view.image[..., 1]
-        cv2.imwrite(str(path / "rgb" / f"{index:05d}.png"), image)
-        depth = np.round(view.depth * 1000).astype(np.uint16)
-        cv2.imwrite(str(path / "depth" / f"{index:05d}.png"), depth)
-    return path
+    return plane_folder(tmp_path_factory.mktemp("plane"))
 
 
 def plain_model(name: str, device: str) -> PinholeModel:
@@ -72,27 +48,6 @@ def test_poses_of_a_folder_give_metres(folder: Path, tmp_path: Path) -> None:
     metric = rows[0].split(",").index("metric_abs_rel")
     known = [bool(row.split(",")[metric]) for row in rows[1:]]
     assert not any(known[:35]) and all(known[45:])
-
-
-def drive(folder: Path, path: Path, offset: float = 0.0) -> Path:
-    """The folder as a bag, its poses as a base's odometry between the images.
-
-    offset: seconds of the odometry's clock.
-    """
-    poses = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4) @ inverse(MOUNT)
-    path.parent.mkdir(exist_ok=True)
-    with RecordingWriter(path) as writer:
-        for index, frame in enumerate(open_recording(folder).frames()):
-            stamp, name = frame.stamp_ns, "camera_optical"
-            assert frame.depth is not None
-            writer.write_png("/camera/image", frame.image, stamp, name)
-            writer.write_depth("/camera/depth", frame.depth, stamp, name)
-            writer.write_camera_info("/camera/camera_info", OWN_CAMERA, SIZE, stamp, name)
-            here = between(poses[index], poses[min(index + 1, len(poses) - 1)], 0.5)
-            when = stamp / SECOND + 0.05
-            message = odometry(here, when + offset)
-            writer.write("/odom", "nav_msgs/msg/Odometry", message, round(when * SECOND))
-    return path
 
 
 def test_odometry_of_a_bag_gives_metres(folder: Path, tmp_path: Path) -> None:
