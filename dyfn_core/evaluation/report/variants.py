@@ -75,7 +75,7 @@ def headline(variants: Sequence[Variant]) -> str:
 
 
 def _sentence(result: Variant, base: Variant | None) -> str:
-    frames = result.scores.get("frames")
+    frames = result.scores.get("scored_frames") or result.scores.get("frames")
     over = f" over {frames} frames" if frames else ""
     if result.drift is None or result.abs_rel is None:
         why = "too few frames have" if result.abs_rel is not None else "no frame has"
