@@ -1,4 +1,4 @@
-"""stream_depth with the tiny model (or "pinhole", "pinhole with DyFN", "endless"), a process of its own."""
+"""stream_depth with the model tiny, pinhole, "pinhole with DyFN" or endless, as a process."""
 
 from __future__ import annotations
 
