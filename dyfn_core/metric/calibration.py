@@ -120,15 +120,20 @@ class ScaleCalibrator:
             self.state = ScaleCalibration()
 
     def push(self, evidence: Evidence) -> None:
-        """One measurement, in the order of the stamps. One without pairs moves nothing."""
+        """One measurement. One without pairs moves nothing.
+
+        It may be of an earlier frame than the one before, as if it had come in its place.
+        """
         self.dropped.update(evidence.dropped)
         if not len(evidence.predicted):
             if self.state.map is None:
                 reasons = ", ".join(sorted(evidence.dropped)) or "an empty measurement"
                 self.state = replace(self.state, problem=f"nothing usable: {reasons}")
             return
-        state, now = self.state, evidence.stamp
-        window = self._window((*state.window, evidence), now)
+        state = self.state
+        now = self._latest(evidence.stamp)
+        ordered = sorted((*state.window, evidence), key=lambda one: one.stamp)
+        window = self._window(tuple(ordered), now)
         started = now if state.started is None else state.started
         self.state = state = replace(state, window=window, started=started)
         if state.map is None and now - started < self.options.seconds * (1 - 1e-9):
@@ -142,6 +147,13 @@ class ScaleCalibrator:
             self.state = self._calibrated(fit, now)
         else:
             self.state = self._compared(state.map, fit, now)
+
+    def _latest(self, stamp: float) -> float:
+        """Stamp of the latest evidence; of this one when its clock has been set back."""
+        known = [one.stamp for one in self.state.window]
+        if not known or max(known) - stamp > _PATIENT * self.options.seconds:
+            return stamp
+        return max(stamp, *known)
 
     def _window(self, window: tuple[Evidence, ...], now: float) -> tuple[Evidence, ...]:
         """Recent evidence, and older one as long as there are too few points without it."""

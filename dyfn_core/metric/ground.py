@@ -5,16 +5,27 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from dyfn_core.metric.references import DepthView, Evidence
+from dyfn_core.metric.references import Evidence
 
 _GRID = 64  # samples along the longer side
 _FEWEST = 40  # samples of a plane
 _BELOW = 0.1  # share of the samples that may lie clearly below the ground
 _BAND = 0.12  # relative distance to the plane within which a sample may belong to it
 _BIN = 0.05  # of the histogram of log heights
+
+
+class GroundView(Protocol):
+    """A predicted cloud. points: H x W x 3, up to scale. valid: H x W bool."""
+
+    @property
+    def points(self) -> np.ndarray: ...
+
+    @property
+    def valid(self) -> np.ndarray: ...
 
 
 class NoGroundError(ValueError):
@@ -87,7 +98,7 @@ def fit_ground(
 
 
 def ground_evidence(
-    view: DepthView, up: np.ndarray, height: float, stamp: float, **options: float
+    view: GroundView, up: np.ndarray, height: float, stamp: float, **options: float
 ) -> Evidence:
     """One pair: the plane's distance, and the camera's known height over it in metres."""
     try:

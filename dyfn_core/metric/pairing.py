@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
+from collections.abc import Sequence
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -11,6 +12,8 @@ T = TypeVar("T")
 
 class Pairing(Generic[T]):
     """Measurements wait here for the frame of their time. Safe for several threads.
+
+    A measurement belongs to the frame of the nearest stamp, among those that are known.
 
     tolerance: seconds between a measurement and a frame that still belong together.
     capacity: measurements that may wait; beyond it the oldest is dropped.
@@ -36,21 +39,26 @@ class Pairing(Generic[T]):
                 self.dropped["overrun"] += 1
             self._waiting.append((stamp, measurement))
 
-    def take(self, stamp: float) -> list[T]:
-        """The measurements that belong to the frame of this stamp; each is given out once."""
-        taken: list[T] = []
+    def take(self, stamp: float, earlier: Sequence[float] = ()) -> list[tuple[float, T]]:
+        """The measurements that belong to known frames; each is given out once.
+
+        stamp: of the present frame. earlier: of frames before it that a measurement may still be
+        of. Returns pairs of the frame's stamp and the measurement, in the order of the stamps.
+        """
+        taken: list[tuple[float, T]] = []
         with self._lock:
             waiting, self._waiting = self._waiting, deque()
             for when, measurement in waiting:
-                if when < stamp - self.tolerance:
+                nearest = min((stamp, *earlier), key=lambda known: abs(known - when))
+                if abs(nearest - when) <= self.tolerance:
+                    taken.append((nearest, measurement))
+                elif when < stamp:
                     self.dropped["stale"] += 1
                 elif when > stamp + self.ahead:
                     self.dropped["future-dated"] += 1
-                elif when > stamp + self.tolerance:
-                    self._waiting.append((when, measurement))
                 else:
-                    taken.append(measurement)
-        return taken
+                    self._waiting.append((when, measurement))
+        return sorted(taken, key=lambda pair: pair[0])
 
     def clear(self) -> None:
         """Forget what waits (a stream that was reset, with another clock)."""

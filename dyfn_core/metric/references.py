@@ -19,14 +19,11 @@ _EMPTY = np.empty(0)
 
 
 class DepthView(Protocol):
-    """Predicted geometry of one frame.
+    """Predicted depth of one frame.
 
-    points: H x W x 3 and depth: H x W float32, up to scale. valid: H x W bool.
-    camera_matrix: 3 x 3, pixels.
+    depth: H x W float32, up to scale. valid: H x W bool. camera_matrix: 3 x 3, pixels.
+    frame_id: name of the camera's optical frame; "" when it has none.
     """
-
-    @property
-    def points(self) -> np.ndarray: ...
 
     @property
     def depth(self) -> np.ndarray: ...
@@ -36,6 +33,9 @@ class DepthView(Protocol):
 
     @property
     def camera_matrix(self) -> np.ndarray: ...
+
+    @property
+    def frame_id(self) -> str: ...
 
 
 @dataclass(frozen=True)

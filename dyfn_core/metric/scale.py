@@ -10,8 +10,8 @@ import numpy as np
 
 from dyfn_core.metric.calibration import CalibrationOptions, ScaleCalibrator, ScalePrior
 from dyfn_core.metric.fit import MetricMap
-from dyfn_core.metric.ground import ground_evidence, up_from_pitch
-from dyfn_core.metric.references import DepthView, Reference
+from dyfn_core.metric.ground import GroundView, ground_evidence, up_from_pitch
+from dyfn_core.metric.references import Evidence
 
 SOURCES = ("none", "fixed", "reference", "camera_height")
 RELATIVE = MetricMap(1.0)
@@ -118,15 +118,15 @@ class MetricScale:
         self.calibrator.reset(keep)
 
     def push(
-        self, view: DepthView, stamp: float, references: Sequence[Reference] = ()
+        self, view: GroundView, stamp: float, measured: Sequence[Evidence] = ()
     ) -> ScaleInForce:
-        """A frame's predicted geometry, and what was measured at its time -> what is in force.
+        """A frame's predicted geometry, and what has been measured -> what is in force.
 
-        stamp: seconds. The result already contains this frame's measurements.
+        stamp: seconds. measured: beside this frame or earlier ones. The result already contains it.
         """
         if self.options.source == "reference":
-            for reference in references:
-                self.calibrator.push(reference.evidence(view, stamp))
+            for evidence in measured:
+                self.calibrator.push(evidence)
         elif self.options.source == "camera_height":
             up = np.array(self.options.up)
             self.calibrator.push(ground_evidence(view, up, self.options.camera_height, stamp))

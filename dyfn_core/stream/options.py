@@ -170,6 +170,13 @@ class StreamOptions:
         "Seconds between the stamps of a measurement and of the image it is compared with.",
         range=(1e-3, 10.0),
     )
+    reference_history: float = option(
+        SCALE,
+        1.0,
+        "Seconds for which predictions are kept for measurements that come after their image. 0: "
+        "such measurements are not used.",
+        range=(0.0, 60.0),
+    )
     camera_height: float = option(
         SCALE,
         0.0,

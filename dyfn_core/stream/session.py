@@ -160,7 +160,8 @@ class StreamSession:
 
         Args:
             stamp: Seconds, on the clock of the frames. The measurement is compared with the frame
-                within `reference_tolerance` of it that is pushed next.
+                of the nearest stamp, within `reference_tolerance` of it: the one that is pushed
+                next, or one of the last `reference_history` seconds.
             reference: A PointReference, DepthReference or ConeReference, in the optical frame.
         """
         self._metric.add_reference(stamp, reference)

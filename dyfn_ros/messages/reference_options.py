@@ -22,6 +22,7 @@ class ReferenceOptions:
     reference_transform: str = option(
         SCALE,
         "",
-        "Pose of the sensor in the camera's optical frame, 'x y z qx qy qz qw'. Empty: at the "
-        "camera, x forward for LaserScan and Range, optical axes for PointCloud2.",
+        "Pose of the sensor in the camera's optical frame, 'x y z qx qy qz qw'. Empty: by tf from "
+        "the frame_id of the messages. Where that is empty or the images' own: at the camera, x "
+        "forward for LaserScan and Range, optical axes for PointCloud2.",
     )

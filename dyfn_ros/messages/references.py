@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from dyfn_core.metric.pose_history import NoPose
 from dyfn_core.metric.references import (
     ConeReference,
     DepthReference,
@@ -23,9 +24,18 @@ from dyfn_core.metric.references import (
 )
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.odometry import frame_name
 from dyfn_ros.messages.reference_options import REFERENCE_TYPES, ReferenceOptions
+from dyfn_ros.messages.transforms import TransformBuffer, TransformError
 
 ULTRASOUND = 0  # sensor_msgs/Range.radiation_type
+IMAGE = "Image"
+NOT_PLACED = "sensor's place unknown"
+_REMEDY = {
+    False: "publish the transform or set reference_transform",
+    True: "expected depth registered to the camera; if it is, set reference_transform to "
+    "'0 0 0 0 0 0 1'",
+}
 _FORMATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField: FLOAT32, FLOAT64
 # REP 103: a body frame (x forward, y left, z up) seen from an optical one at the same place.
 _BODY_TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -66,7 +76,7 @@ def parse_transform(text: str, kind: str) -> Transform:
     """The node's reference_transform, see parse_pose.
 
     "" is the camera's own place: optical axes for PointCloud2, those of REP 103 (x forward) for
-    LaserScan and Range. A depth Image is registered to the camera and has none.
+    LaserScan and Range. A depth Image is registered to the camera: its pose can only be none.
     Raises ValueError that says what was expected.
     """
     if kind not in REFERENCE_TYPES:
@@ -74,9 +84,59 @@ def parse_transform(text: str, kind: str) -> Transform:
     if not text.strip():
         turned = kind in ("LaserScan", "Range")
         return Transform(_BODY_TO_OPTICAL if turned else np.eye(3), np.zeros(3))
-    if kind == "Image":
-        raise ValueError(f"reference_transform is {text!r}, but a depth Image must be registered")
-    return parse_pose(text, "reference_transform")
+    found = parse_pose(text, "reference_transform")
+    if kind == IMAGE and not _nearly_none(found.rotation, found.translation):
+        raise ValueError(
+            f"reference_transform is {text!r}, but a depth Image must be registered: expected "
+            "'0 0 0 0 0 0 1' or nothing"
+        )
+    return found
+
+
+def _nearly_none(rotation: np.ndarray, translation: np.ndarray) -> bool:
+    """Whether a transform leaves points where they are, to 1 mm and 1 mrad."""
+    return bool(np.abs(rotation - np.eye(3)).max() < 1e-3 and np.abs(translation).max() < 1e-3)
+
+
+class UnplacedError(MessageError):
+    """It is not known where the sensor of a message is; the text names both frames."""
+
+
+class SensorPlace:
+    """Where the sensor of a reference is: by reference_transform, else by tf."""
+
+    def __init__(self, options: ReferenceOptions, transforms: TransformBuffer) -> None:
+        """Raises ValueError as parse_transform."""
+        self._kind = options.reference_type
+        self._given = bool(options.reference_transform.strip())
+        self._default = parse_transform(options.reference_transform, self._kind)
+        self._transforms = transforms
+
+    def of(self, message: Any, camera: str, stamp: int) -> Transform:
+        """From the frame of a message to the camera's optical frame at a moment (nanoseconds).
+
+        Without a frame_id on either side, or with the same one, the sensor is at the camera: see
+        parse_transform.
+
+        Raises:
+            UnplacedError: tf does not know it, or a depth Image is of another place.
+        """
+        sensor, camera = frame_name(message.header.frame_id), frame_name(camera)
+        if self._given or not sensor or not camera or sensor == camera:
+            return self._default
+        between = f"its frame_id is {sensor!r}, the images are of {camera!r}"
+        try:
+            found = self._transforms.lookup(camera, sensor, stamp)
+        except TransformError as error:
+            raise UnplacedError(
+                f"{between}, and {error}; {_REMEDY[self._kind == IMAGE]}"
+            ) from error
+        if isinstance(found, NoPose):
+            raise UnplacedError(f"{between}, and {found.detail}")
+        pose = found.pose
+        if self._kind == IMAGE and not _nearly_none(pose[:3, :3], pose[:3, 3]):
+            raise UnplacedError(f"{between}, and tf has them apart; {_REMEDY[True]}")
+        return Transform(pose[:3, :3], pose[:3, 3])
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
@@ -154,21 +214,16 @@ def decode_range(message: Any) -> tuple[float, float, bool]:
     return distance if good else math.nan, view / 2, int(message.radiation_type) == ULTRASOUND
 
 
-def reference_decoder(kind: str, transform: Transform) -> Callable[[Any], Reference]:
-    """The function that makes a measurement of a message of this type; raises MessageError."""
-
-    def cone(message: Any) -> Reference:
+def decode_reference(message: Any, kind: str, transform: Transform) -> Reference:
+    """A measurement of a message of this type; raises MessageError."""
+    if kind == IMAGE:
+        return DepthReference(messages.decode_depth(message))
+    if kind == "Range":
         distance, half_angle, sound = decode_range(message)
         hit = transform(np.array([[distance, 0.0, 0.0]]))[0]
         return ConeReference(hit, half_angle, nearest=sound)
-
-    decoders: dict[str, Callable[[Any], Reference]] = {
-        "Image": lambda message: DepthReference(messages.decode_depth(message)),
-        "PointCloud2": lambda message: PointReference(transform(decode_points(message))),
-        "LaserScan": lambda message: PointReference(transform(decode_scan(message))),
-        "Range": cone,
-    }
-    return decoders[kind]
+    points = decode_scan(message) if kind == "LaserScan" else decode_points(message)
+    return PointReference(transform(points))
 
 
 @dataclass(frozen=True)
@@ -176,35 +231,44 @@ class MessageReference:
     """A measurement that is decoded when a frame is compared with it.
 
     So a message that never meets a frame costs nothing. One that cannot be read counts as
-    "not decodable", and `warn` takes the reason.
+    "not decodable", one of a sensor whose place is unknown as "sensor's place unknown", and `warn`
+    takes the reason.
     """
 
     message: Any
-    decode: Callable[[Any], Reference]
+    stamp: float
+    kind: str
+    place: SensorPlace
     warn: Callable[[str], None]
 
     def evidence(self, view: DepthView, stamp: float) -> Evidence:
         """See dyfn_core.metric.references.Reference."""
         try:
-            reference = self.decode(self.message)
+            transform = self.place.of(self.message, view.frame_id, round(self.stamp * 1e9))
+            reference = decode_reference(self.message, self.kind, transform)
         except MessageError as error:
             self.warn(str(error))
-            return Evidence(stamp, np.empty(0), np.empty(0), Counter({"not decodable": 1}))
+            reason = NOT_PLACED if isinstance(error, UnplacedError) else "not decodable"
+            return Evidence(stamp, np.empty(0), np.empty(0), Counter({reason: 1}))
         return reference.evidence(view, stamp)
 
 
 def message_references(
-    options: ReferenceOptions, warn: Callable[[str], None]
-) -> Callable[[Any], MessageReference]:
-    """The function that makes a measurement of a message, for StreamSession.add_reference.
+    options: ReferenceOptions,
+    warn: Callable[[str], None],
+    transforms: TransformBuffer | None = None,
+) -> Callable[[Any, float], MessageReference]:
+    """The function that makes a measurement of a message and its stamp (seconds), for
+    StreamSession.add_reference.
 
     Args:
         options: Type of the messages, and where the sensor is.
-        warn: Takes the reason why a message cannot be read.
+        warn: Takes the reason why a message cannot be used.
+        transforms: Of /tf and /tf_static; None: nothing is known.
 
     Raises:
         ValueError: reference_type or reference_transform is not usable; the text names it.
     """
+    place = SensorPlace(options, transforms or TransformBuffer())
     kind = options.reference_type
-    decode = reference_decoder(kind, parse_transform(options.reference_transform, kind))
-    return lambda message: MessageReference(message, decode, warn)
+    return lambda message, stamp: MessageReference(message, stamp, kind, place, warn)

@@ -90,7 +90,7 @@ class Camera:
         self._placed: Frame | None = None  # the begun frame, if its pose was wanted at once
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
-        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings())
+        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings(), transforms)
         self.odometry = OdometryTopic(ports, self.prefix, settings(), transforms)
 
     @property

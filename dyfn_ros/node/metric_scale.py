@@ -14,6 +14,7 @@ from std_msgs.msg import Float64
 from dyfn_core.metric.scale import ScaleInForce
 from dyfn_core.stream.session import StreamSession
 from dyfn_ros.messages.references import message_references
+from dyfn_ros.node.odometry import TransformTopics
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 
@@ -32,6 +33,7 @@ class ScaleTopics:
         prefix: str,
         title: str,
         settings: NodeSettings,
+        transforms: TransformTopics,
     ) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._title = title
@@ -39,6 +41,7 @@ class ScaleTopics:
         self._status = ports.publisher(DiagnosticStatus, f"~/{prefix}scale/status", latched)
         self._take: Callable[[Any], None] = lambda message: None
         self.topic = ""
+        self._transforms = transforms.buffer
         if settings.metric_source == "reference":
             kind = getattr(sensor_msgs.msg, settings.reference_type)
             best_effort = QoSProfile(
@@ -48,20 +51,24 @@ class ScaleTopics:
                 kind, f"{prefix}reference", lambda message: self._take(message), best_effort
             )
             self.topic = subscription.topic_name
+            if not settings.reference_transform.strip():
+                transforms.subscribe()
 
     def open(
         self, session: StreamSession, settings: NodeSettings, warn: Callable[[str], None]
     ) -> None:
         """Give the session what comes from now on.
 
-        warn: takes the reason why a measurement cannot be read. Raises ValueError when the
+        warn: takes the reason why a measurement cannot be used. Raises ValueError when the
         settings of the reference are not usable.
         """
-        reference = message_references(settings, lambda reason: warn(f"{self.topic}: {reason}"))
+        reference = message_references(
+            settings, lambda reason: warn(f"{self.topic}: {reason}"), self._transforms
+        )
 
         def take(message: Any) -> None:  # executor's thread
-            stamp = message.header.stamp
-            session.add_reference(stamp.sec + stamp.nanosec * 1e-9, reference(message))
+            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+            session.add_reference(stamp, reference(message, stamp))
 
         self._take = take
 

@@ -22,9 +22,9 @@ from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder, read_poses
 from dyfn_ros.recordings.storage.base import Recorded, Storage
 from dyfn_ros.recordings.storage.open import open_storage
 from dyfn_ros.recordings.topics import NONE
+from dyfn_ros.recordings.transform_topics import STATIC
 from dyfn_ros.recordings.typestore import TF as TF_MESSAGE
 
-STATIC = "tf_static"
 # Of a whole recording that is read at once: nothing is dropped, and no step is too fast.
 _EVERYTHING = PoseLimits(speed=math.inf, turn=math.inf, back=math.inf, capacity=None)
 

@@ -19,6 +19,7 @@ from dyfn_ros.recordings.image_recording import ImageRecording
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.reference_topic import ReferenceTopic
 from dyfn_ros.recordings.rgbd_folder import RgbdRecording
+from dyfn_ros.recordings.transform_topics import TransformFeed
 from dyfn_ros.replay.pose_feed import PoseFeed
 from dyfn_ros.replay.settings import SessionOptions, Source
 
@@ -34,23 +35,35 @@ class ReferenceFeed:
     """The measurements of a recording, each with the first frame that is recorded after it."""
 
     def __init__(
-        self, topic: ReferenceTopic, decode: Callable[[Any], Reference], is_truth: bool
+        self,
+        topic: ReferenceTopic,
+        decode: Callable[[Any, float], Reference],
+        is_truth: bool,
+        transforms: TransformFeed | None = None,
     ) -> None:
         """Begin at the first measurement.
 
         Args:
             topic: Where they are.
-            decode: Makes a measurement of a message.
+            decode: Makes a measurement of a message and its stamp (seconds).
             is_truth: Whether the scores are of the same topic.
+            transforms: What decoding needs to have been read; None: nothing.
         """
         self.topic = topic
         self.is_truth = is_truth
-        self._decode = decode
+        self._decode, self._transforms = decode, transforms
 
     def before(self, frame: RecordedFrame) -> Iterator[tuple[float, Reference]]:
         """Stamp (seconds) and measurement of what was recorded up to a frame, once each."""
+        if self._transforms is not None:
+            self._transforms.until(frame.source.log_ns)
         for stamp, message in self.topic.until(frame.source.log_ns):
-            yield stamp, self._decode(message)
+            yield stamp, self._decode(message, stamp)
+
+    def losses(self) -> dict[str, int]:
+        """Messages that could not be read, with how often."""
+        found = dict(self.topic.losses)
+        return found if self._transforms is None else found | dict(self._transforms.losses)
 
 
 class SourceReader:
@@ -138,7 +151,11 @@ class SourceReader:
             self.recording.notes.losses[f"{topic.name}: measurement skipped: {reason}"] += 1
 
         is_truth = topic.name == self.recording.topics.depth
-        return ReferenceFeed(topic, message_references(options, unreadable), is_truth)
+        if options.reference_transform.strip():
+            return ReferenceFeed(topic, message_references(options, unreadable), is_truth)
+        feed = TransformFeed(source.recording, options.pose_limits, source.stamps)
+        decode = message_references(options, unreadable, feed.buffer)
+        return ReferenceFeed(topic, decode, is_truth, feed)
 
     def poses(self, options: SessionOptions) -> PoseFeed | None:
         """The camera's poses, from the first frame on.

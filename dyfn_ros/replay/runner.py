@@ -145,7 +145,7 @@ class StreamRunner:
     def losses(self) -> dict[str, int]:
         """Measurements and poses that could not be read, with how often."""
         found = {} if self._poses is None else self._poses.losses()
-        return found | ({} if self._references is None else dict(self._references.topic.losses))
+        return found | ({} if self._references is None else self._references.losses())
 
 
 def _check_folder(state_file: str) -> None:

@@ -173,3 +173,17 @@ def test_tracked_scale_is_always_positive_finite_and_near_what_was_measured(
 def test_bad_options_are_refused(options: dict[str, object], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         CalibrationOptions(**options)  # type: ignore[arg-type]
+
+
+def test_late_evidence_counts_as_if_it_had_come_in_time() -> None:
+    in_time, late = ScaleCalibrator(), ScaleCalibrator()
+    stamps = [step / 10 for step in range(30)]
+    swapped = [stamp for pair in zip(stamps[1::2], stamps[::2], strict=True) for stamp in pair]
+    for one, other in zip(stamps, swapped, strict=True):
+        in_time.push(evidence(one, 2.0))
+        late.push(evidence(other, 2.0))
+    window = [one.stamp for one in late.state.window]
+    assert window == [one.stamp for one in in_time.state.window]
+    assert late.state.stamp == in_time.state.stamp == stamps[-1]
+    assert late.state.map is not None
+    assert late.state.map.scale == pytest.approx(2.0, rel=0.01)

@@ -24,6 +24,7 @@ class View:
     depth: np.ndarray
     valid: np.ndarray
     camera_matrix: np.ndarray
+    frame_id: str = ""
 
 
 def view_of(depth: np.ndarray) -> View:

@@ -23,6 +23,7 @@ class View:
     depth: np.ndarray
     valid: np.ndarray
     camera_matrix: np.ndarray
+    frame_id: str = ""
 
 
 def floor_view(pitch: float = 0.5) -> View:
@@ -41,7 +42,8 @@ def measured(view: View, scale: float, seed: int = 0, count: int = 15) -> PointR
 
 
 def test_without_a_source_depth_is_relative_and_says_so() -> None:
-    scale = MetricScale().push(floor_view(), 0.0, [measured(floor_view(), 2.0)])
+    view = floor_view()
+    scale = MetricScale().push(view, 0.0, [measured(view, 2.0).evidence(view, 0.0)])
     assert not scale.metric
     assert scale.problem == "no metric source is configured"
 
@@ -56,7 +58,7 @@ def test_a_fixed_scale_is_there_at_once_and_outlives_resets() -> None:
 def test_reference_calibrates_ages_and_is_forgotten_at_a_reset() -> None:
     metric, view = MetricScale(ScaleOptions("reference")), floor_view()
     for step in range(12):
-        scale = metric.push(view, step / 10, [measured(view, 2.5, step)])
+        scale = metric.push(view, step / 10, [measured(view, 2.5, step).evidence(view, step / 10)])
         assert scale.metric == (step >= 10)
     assert scale.map is not None
     assert scale.map.scale == pytest.approx(2.5, rel=1e-3)
@@ -114,17 +116,25 @@ def test_measurements_wait_for_the_frame_of_their_time() -> None:
     pairing: Pairing[str] = Pairing(tolerance=0.05, ahead=1.0)
     for stamp, name in ((0.8, "stale"), (0.97, "a"), (1.04, "b"), (1.3, "later"), (9.0, "future")):
         pairing.put(stamp, name)
-    assert pairing.take(1.0) == ["a", "b"]
+    assert pairing.take(1.0) == [(1.0, "a"), (1.0, "b")]
     assert pairing.take(1.0) == []
-    assert pairing.take(1.28) == ["later"]
+    assert pairing.take(1.28) == [(1.28, "later")]
     assert pairing.dropped == {"stale": 1, "future-dated": 1}
+
+
+def test_measurements_that_come_late_belong_to_the_nearest_earlier_frame() -> None:
+    pairing: Pairing[str] = Pairing(tolerance=0.1)
+    for stamp, name in ((0.98, "now"), (0.93, "d"), (0.72, "b"), (0.55, "gone"), (0.86, "c")):
+        pairing.put(stamp, name)
+    assert pairing.take(1.0, [0.7, 0.8, 0.9]) == [(0.7, "b"), (0.9, "d"), (0.9, "c"), (1.0, "now")]
+    assert pairing.dropped == {"stale": 1}
 
 
 def test_too_many_waiting_measurements_cost_the_oldest() -> None:
     pairing: Pairing[int] = Pairing(tolerance=10, capacity=3)
     for number in range(5):
         pairing.put(0.0, number)
-    assert pairing.take(0.0) == [2, 3, 4]
+    assert pairing.take(0.0) == [(0.0, 2), (0.0, 3), (0.0, 4)]
     assert pairing.dropped == {"overrun": 2}
     pairing.put(0.0, 7)
     pairing.clear()

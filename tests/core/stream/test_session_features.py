@@ -175,3 +175,50 @@ def test_cameras_that_share_a_path_have_files_of_their_own() -> None:
     assert path_for("/a/s.safetensors", "front", True) == "/a/s.front.safetensors"
     assert path_for("/a/s.safetensors", "front", False) == "/a/s.safetensors"
     assert path_for("", "front", True) == ""
+
+
+def late_session(late: float, **options: Any) -> tuple[StreamSession, list[bool]]:
+    """Every picture is measured, and the measurement comes `late` seconds after it."""
+    session = session_of(metric_source="reference", scene_cut_threshold=0.0, **options)
+    relative, waiting, metric = session_of(scene_cut_threshold=0.0), [], []
+    for step in range(20):
+        stamp = 5 + step / 10
+        plain = push(relative, picture(step % 3), stamp)
+        rows, columns = np.nonzero(plain.valid)
+        waiting.append((stamp, 3.0 * plain.points[rows[::40], columns[::40]]))
+        while waiting and waiting[0][0] <= stamp - late + 1e-6:
+            when, points = waiting.pop(0)
+            session.add_reference(when, PointReference(points))
+        metric.append(push(session, picture(step % 3), stamp).metric)
+    return session, metric
+
+
+def test_measurements_that_come_after_their_image_count_with_its_prediction() -> None:
+    """The pictures differ, so that another frame's prediction would give another scale."""
+    at_once, metric = late_session(0.0, reference_tolerance=0.02)
+    late, metric_late = late_session(0.4, reference_tolerance=0.02)
+    assert metric.index(True) == 10
+    assert metric_late.index(True) == 14
+    assert late.scale.map is not None and at_once.scale.map is not None
+    assert late.scale.map.scale == pytest.approx(3, rel=1e-4)
+    assert late.scale.map.scale == at_once.scale.map.scale
+    assert set(late.unused_references) == {"at a depth edge"}
+    assert late.report()["scale: measured after their image"] == "16"
+    assert at_once.report()["scale: measured after their image"] == "0"
+
+
+def test_measurements_later_than_the_history_are_stale() -> None:
+    for late, history in ((0.4, 0.0), (0.4, 0.25)):
+        session, metric = late_session(late, reference_tolerance=0.02, reference_history=history)
+        assert not any(metric)
+        assert session.unused_references == {"stale": 16}
+
+
+def test_a_measurement_of_before_a_reset_is_stale() -> None:
+    session = session_of(metric_source="reference", scene_cut_threshold=0.0)
+    for stamp in (1.0, 1.1):
+        push(session, picture(0), stamp)
+    session.add_reference(1.0, PointReference(np.ones((3, 3))))
+    session.request_reset()
+    push(session, picture(0), 1.3)
+    assert session.unused_references == {"stale": 1}

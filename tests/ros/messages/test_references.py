@@ -13,17 +13,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import Image, LaserScan, PointCloud2, PointField, Range
 
+from dyfn_core.geometry.rigid import rigid
 from dyfn_core.metric.references import ConeReference, DepthReference, PointReference
 from dyfn_ros.messages.images import MessageError
 from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.messages.references import (
     decode_points,
     decode_range,
+    decode_reference,
     decode_scan,
     message_references,
     parse_transform,
-    reference_decoder,
 )
+from dyfn_ros.messages.transforms import TransformBuffer
+from tests.support.odometry import tf_message, transform
 
 FLOAT32, FLOAT64, UINT16 = 7, 8, 4
 
@@ -166,7 +169,7 @@ def test_transform_turns_then_moves() -> None:
         ("1 2 3 0 0 0 x", "PointCloud2", "expected seven numbers"),
         ("0 0 0 0 0 0 2", "Range", "quaternion of length 1, not 2"),
         ("0 0 0 0 0 0 nan", "Range", "expected seven numbers"),
-        ("0 0 0 0 0 0 1", "Image", "must be registered"),
+        ("0 0 0.1 0 0 0 1", "Image", "must be registered"),
         ("", "Imu", "reference_type is 'Imu'"),
     ],
 )
@@ -178,26 +181,35 @@ def test_bad_transforms_say_what_was_expected(text: str, kind: str, reason: str)
 def test_each_type_becomes_its_kind_of_measurement() -> None:
     depth = Image(height=1, width=3, encoding="16UC1", step=6)
     depth.data = array.array("B", struct.pack("<3H", 1500, 0, 250))
-    decoded = reference_decoder("Image", parse_transform("", "Image"))(depth)
+    decoded = decode_reference(depth, "Image", parse_transform("", "Image"))
     assert isinstance(decoded, DepthReference)
     np.testing.assert_allclose(decoded.depth, [[1.5, np.nan, 0.25]])
 
-    decoded = reference_decoder("PointCloud2", parse_transform("0 0 1 0 0 0 1", "PointCloud2"))(
-        cloud(POINTS)
+    decoded = decode_reference(
+        cloud(POINTS), "PointCloud2", parse_transform("0 0 1 0 0 0 1", "PointCloud2")
     )
     assert isinstance(decoded, PointReference)
     np.testing.assert_allclose(decoded.points[0], [1, 2, 4])
 
     scan = LaserScan(angle_increment=0.1, range_max=5.0, ranges=[2.0])
-    decoded = reference_decoder("LaserScan", parse_transform("", "LaserScan"))(scan)
+    decoded = decode_reference(scan, "LaserScan", parse_transform("", "LaserScan"))
     assert isinstance(decoded, PointReference)
     np.testing.assert_allclose(decoded.points, [[0, 0, 2]], atol=1e-12)
 
     reading = Range(field_of_view=0.4, max_range=5.0, range=2.0)
-    decoded = reference_decoder("Range", parse_transform("0.5 0 0 0 0 0 1", "Range"))(reading)
+    decoded = decode_reference(reading, "Range", parse_transform("0.5 0 0 0 0 0 1", "Range"))
     assert isinstance(decoded, ConeReference)
     np.testing.assert_allclose(decoded.hit, [2.5, 0, 0])
     assert decoded.half_angle == pytest.approx(0.2)
+
+
+def small_view(frame_id: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        depth=np.ones((3, 3), np.float32),
+        valid=np.ones((3, 3), bool),
+        camera_matrix=np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]),
+        frame_id=frame_id,
+    )
 
 
 def test_a_message_is_decoded_when_a_frame_needs_it_and_a_bad_one_is_counted() -> None:
@@ -205,19 +217,63 @@ def test_a_message_is_decoded_when_a_frame_needs_it_and_a_bad_one_is_counted() -
     make = message_references(ReferenceOptions(), warnings.append)
     broken, good = cloud(POINTS), cloud([(0.0, 0.0, 2.0)])
     broken.fields = []
-    view = SimpleNamespace(
-        points=np.ones((3, 3, 3), np.float32),
-        depth=np.ones((3, 3), np.float32),
-        valid=np.ones((3, 3), bool),
-        camera_matrix=np.array([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]]),
-    )
-    bad = make(broken)
+    view = small_view("camera")
+    bad = make(broken, 5.0)
     assert not warnings
     assert bad.evidence(view, 5.0).dropped == {"not decodable": 1}
     assert "expected x, y and z" in warnings[0]
-    assert make(good).evidence(view, 5.0).measured.tolist() == [2.0]
+    assert make(good, 5.0).evidence(view, 5.0).measured.tolist() == [2.0]
     with pytest.raises(ValueError, match="expected seven numbers"):
         message_references(ReferenceOptions(reference_transform="1 2"), warnings.append)
+
+
+def lidar_cloud(frame_id: str, points: list[tuple[float, float, float]]) -> PointCloud2:
+    message = cloud(points)
+    message.header.frame_id = frame_id
+    return message
+
+
+def test_a_sensor_of_another_frame_is_placed_by_tf() -> None:
+    """The lidar is 1 m behind the camera and looks as a body does: x is forward."""
+    warnings: list[str] = []
+    buffer = TransformBuffer()
+    make = message_references(ReferenceOptions(), warnings.append, buffer)
+    ahead = lidar_cloud("/lidar", [(3.0, 0.0, 0.0)])
+    view = small_view("camera")
+    assert make(ahead, 5.0).evidence(view, 5.0).dropped == {"sensor's place unknown": 1}
+    assert "its frame_id is 'lidar', the images are of 'camera', and tf has no frame" in warnings[0]
+    assert "set reference_transform" in warnings[0]
+    body = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    behind = rigid(body, np.array([0.0, 0.0, -1.0]))
+    buffer.take(tf_message(transform(behind, 0, "camera", "lidar")), True)
+    found = make(ahead, 5.0).evidence(view, 5.0)
+    assert found.measured == pytest.approx([2.0])
+    own = lidar_cloud("camera", [(0.0, 0.0, 2.5)])
+    assert make(own, 5.0).evidence(view, 5.0).measured.tolist() == [2.5]
+    given = ReferenceOptions(reference_transform="0 0 1 0 0 0 1")
+    elsewhere = lidar_cloud("nowhere", [(0.0, 0.0, 2.0)])
+    made = message_references(given, warnings.append, buffer)(elsewhere, 5.0)
+    assert made.evidence(view, 5.0).measured.tolist() == [3.0]
+
+
+def test_depth_of_another_frame_must_be_registered() -> None:
+    warnings: list[str] = []
+    buffer = TransformBuffer()
+    beside = rigid(np.eye(3), np.array([0.025, 0.0, 0.0]))
+    tied = transform(beside, 0, "camera", "depth"), transform(np.eye(4), 0, "camera", "aligned")
+    buffer.take(tf_message(*tied), True)
+    depth = Image(height=3, width=3, encoding="32FC1", step=12)
+    depth.data = array.array("B", np.full((3, 3), 2.0, "<f4").tobytes())
+    counts = []
+    for pose in ("", "0 0 0 0 0 0 1"):
+        options = ReferenceOptions(reference_type="Image", reference_transform=pose)
+        make = message_references(options, warnings.append, buffer)
+        for name in ("depth", "aligned", "camera", ""):
+            depth.header.frame_id = name
+            counts.append(len(make(depth, 5.0).evidence(small_view("camera"), 5.0).measured))
+    assert counts == [0, 9, 9, 9, 9, 9, 9, 9]
+    (warning,) = warnings
+    assert "its frame_id is 'depth', the images are of 'camera', and tf has them apart" in warning
 
 
 def test_messages_of_recordings_are_read_as_well() -> None:

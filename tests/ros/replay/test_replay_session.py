@@ -149,7 +149,9 @@ def test_a_cloud_in_metres_needs_no_truth(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "cloud.ply").exists()
 
 
-def measured(path: Path, clouds: list[Measured], damaged: bool = False) -> Path:
+def measured(
+    path: Path, clouds: list[Measured], damaged: bool = False, frame_id: str = "camera"
+) -> Path:
     """Five images with their truth, a second apart from 1 s on, and clouds logged at their time."""
     events: list[tuple[float, Any]] = [(1.0 + i, frame) for i, frame in enumerate(rgbd(5))]
     events += clouds
@@ -161,17 +163,17 @@ def measured(path: Path, clouds: list[Measured], damaged: bool = False) -> Path:
                 writer.write_camera_info("/camera_info", CAMERA, SIZE, stamp, "camera")
                 writer.write_depth("/depth", np.asarray(event.depth_m), stamp, "camera")
             else:
-                message = point_cloud(event, stamp)
+                message = point_cloud(event, stamp, frame_id)
                 if damaged:
                     message.fields = message.fields[:2]
                 writer.write("/lidar", POINT_CLOUD, message, stamp)
     return path
 
 
-def point_cloud(points: np.ndarray, stamp_ns: int) -> Any:
+def point_cloud(points: np.ndarray, stamp_ns: int, frame_id: str) -> Any:
     field = TYPES.types["sensor_msgs/msg/PointField"]
     return TYPES.types[POINT_CLOUD](
-        header=header(stamp_ns, "camera"),
+        header=header(stamp_ns, frame_id),
         height=1,
         width=len(points),
         fields=[field(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate("xyz")],
@@ -214,11 +216,16 @@ def test_a_reference_topic_gives_metres_and_what_is_not_used_is_counted(tmp_path
 
 
 def test_a_measurement_is_not_used_before_it_was_recorded(tmp_path: Path) -> None:
-    """Recorded just after each image: of the time of an image that has gone."""
+    """Recorded just after each image: they count from the next image on, or not at all."""
     clouds = predicted_clouds(tmp_path)
     late = [(second + 0.06, points) for second, points in clouds]
     path = measured(tmp_path / "walk.mcap", late)
     assert run(path, tmp_path / "out", *REFERENCE) == ALL
+    known = [bool(np.isfinite(depth).any()) for depth in depths(tmp_path / "out")]
+    assert known == [False, False, False, True, True]
+    found = metrics(tmp_path / "out")
+    assert float(found["metric_scale"]["scale"]) == pytest.approx(3, rel=0.02)
+    assert run(path, tmp_path / "out", *REFERENCE, "--reference-history", "0") == ALL
     found = metrics(tmp_path / "out")
     assert found["metric_scale"]["unit"] == "relative"
     assert found["recording"]["warnings"] == {
@@ -226,6 +233,18 @@ def test_a_measurement_is_not_used_before_it_was_recorded(tmp_path: Path) -> Non
         "/lidar: measurements or points not used: stale": 4,  # the fifth is after the last image
     }
     assert "metric" not in found
+
+
+def test_a_sensor_whose_place_is_unknown_gives_no_metres(tmp_path: Path) -> None:
+    path = measured(tmp_path / "walk.mcap", predicted_clouds(tmp_path), frame_id="lidar")
+    assert run(path, tmp_path / "out", *REFERENCE) == PARTIAL
+    found = metrics(tmp_path / "out")
+    assert found["metric_scale"]["unit"] == "relative"
+    (loss,) = found["recording"]["losses"].items()
+    assert "its frame_id is 'lidar', the images are of 'camera', and tf has no frame" in loss[0]
+    assert loss[1] == 5
+    text = "/lidar: measurements or points not used: sensor's place unknown"
+    assert found["recording"]["warnings"][text] == 5
 
 
 def test_measurements_that_cannot_be_read_are_losses(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import Trigger
 
-from dyfn_core.geometry.rigid import between, inverse
+from dyfn_core.geometry.rigid import between, inverse, quaternion_rotation, rigid
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.stream.picture_check import BLANK, FROZEN
 from dyfn_ros.messages.images import decode_depth
@@ -221,7 +221,10 @@ def relative(
 
 
 def test_a_reference_topic(session: Callable[..., Session]) -> None:
-    """Nothing before the calibration, metres after it, and a stale measurement counts."""
+    """Nothing before the calibration, metres after it, and a stale measurement counts.
+
+    The sensor is placed by tf, and every other measurement comes after its image.
+    """
     bench = session(
         metric_source="reference",
         calibration="track",
@@ -231,15 +234,20 @@ def test_a_reference_topic(session: Callable[..., Session]) -> None:
     )
     seconds = [20, 21, 22, 23, 24, 25]
     pictures = frames(len(seconds), seed=4)
-    sent: list[Message] = [cloud_message(np.ones((3, 3)), (5, 0))]
+    sensor = rigid(quaternion_rotation(0.8, 0.0, 0.6, 0.0), np.array([0.3, -0.2, 0.1]))
+    sent: list[Message] = [transform(sensor, 0, "optical", "lidar")]
+    sent += [cloud_message(np.ones((3, 3)), (5, 0), "lidar")]
     pairs = zip(seconds, images(seconds, pictures), relative(bench, seconds, pictures), strict=True)
     for second, image, points in pairs:
-        sent += [cloud_message(3.0 * points, (second, 200_000_000)), image]
+        points = (3.0 * points - sensor[:3, 3]) @ sensor[:3, :3]
+        cloud = cloud_message(points, (second, 200_000_000), "lidar")
+        sent += [image, cloud] if second % 2 else [cloud, image]
     live = bench.live(sent)
     offline, metrics = bench.replay(sent, "--reference-topic", "/cloud")
     assert live == offline
     assert not finite(offline[0]) and finite(offline[-1])
     assert metrics["metric_scale"]["source"] == "reference"
+    assert float(metrics["metric_scale"]["scale"]) == pytest.approx(3, rel=0.02)
     assert metrics["recording"]["warnings"]["/cloud: measurements or points not used: stale"] == 1
 
 
