@@ -91,7 +91,7 @@ class DepthOutputs:
             if RRD in self._kinds:
                 self._views.append(stack.enter_context(FileView(self._place(RRD), self._stem)))
             if self._writing.view:
-                self._views.append(stack.enter_context(LiveView(self._stem)))
+                self._views.append(stack.enter_context(LiveView(self._stem, self._warn)))
             self._stack = stack.pop_all()
         return self
 
@@ -104,6 +104,9 @@ class DepthOutputs:
         self._stack.__exit__(kind, error, trace)
         if kind is None and self._names:
             self.written += [self._place(one) for one in self._kinds if one not in PER_FRAME]
+
+    def _warn(self, reason: str) -> None:
+        self.warnings[reason] += 1
 
     def write(self, frame: SourceFrame, prediction: Prediction[np.ndarray]) -> None:
         """One frame; `frame.image` is as the stream saw it."""

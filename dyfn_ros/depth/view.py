@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import sysconfig
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +21,7 @@ from dyfn_ros.replay.rerun import RerunFile, load_rerun, log_frame
 
 APPLICATION = "dyfn_depth"
 SHOWN = 960  # pixels of the longer side of what the viewer gets
+PATIENCE = 20.0  # seconds for the viewer to answer
 MEMORY = "2GB"  # that the viewer keeps; older frames go
 
 
@@ -80,24 +85,55 @@ def _shrunk(
     return image[grid], small
 
 
-class LiveView(_View):
-    """A viewer's window, which stays open when the run ends."""
+@contextmanager
+def _own_commands() -> Iterator[None]:
+    """Commands beside this Python are found, also where its environment is not activated."""
+    before = os.environ.get("PATH", "")
+    os.environ["PATH"] = os.pathsep.join(filter(None, [sysconfig.get_path("scripts"), before]))
+    try:
+        yield
+    finally:
+        os.environ["PATH"] = before
 
-    def __init__(self, name: str) -> None:
-        """Open the viewer. Raises OutputError."""
+
+class LiveView(_View):
+    """A viewer's window, which stays open when the run ends.
+
+    A viewer that is closed meanwhile does not end the run.
+    """
+
+    def __init__(self, name: str, warn: Callable[[str], None]) -> None:
+        """Open the viewer.
+
+        Args:
+            name: Of the recording.
+            warn: Takes what went wrong with the viewer after that.
+
+        Raises:
+            OutputError: It cannot be opened, or does not answer, as without a display.
+        """
         rerun = load_rerun()
         recording = rerun.RecordingStream(APPLICATION, recording_id=name)
         try:
-            recording.spawn(memory_limit=MEMORY, default_blueprint=blueprint(rerun))
+            with _own_commands():
+                recording.spawn(memory_limit=MEMORY, default_blueprint=blueprint(rerun))
+            recording.flush(timeout_sec=PATIENCE)
         except (OSError, RuntimeError) as error:
-            raise OutputError(f"--view: the Rerun viewer cannot be opened: {error}") from error
+            reason = str(error).splitlines()[0]
+            raise OutputError(
+                f"--view: the Rerun viewer cannot be opened ({reason}); it needs a display"
+            ) from error
         super().__init__(recording)
+        self._warn = warn
 
     def __enter__(self) -> LiveView:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._recording.flush(timeout_sec=5.0)
+        try:
+            self._recording.flush(timeout_sec=PATIENCE)
+        except RuntimeError:
+            self._warn("--view: the Rerun viewer was closed before the end")
         self._recording.disconnect()
 
 

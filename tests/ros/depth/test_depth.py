@@ -378,6 +378,54 @@ def test_a_failing_model_leaves_no_half_file(tmp_path: Path) -> None:
     assert kept(tmp_path) == ["photos/0.png", "photos/1.png", "photos/2.png"]
 
 
+def entities(path: Path) -> set[str]:
+    from rerun.chunk import RrdReader
+
+    (recording,) = RrdReader(path).recordings()
+    return {str(chunk.entity_path) for chunk in RrdReader(path).stream()} if recording else set()
+
+
+@pytest.mark.parametrize("metric", ["none", "fixed"])
+def test_the_viewer_gets_image_depth_points_and_scale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metric: str
+) -> None:
+    """A file in the place of the viewer's window gets what `--write rrd` writes."""
+    rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    shown = tmp_path / "shown.rrd"
+
+    def into_file(self: Any, *, default_blueprint: Any, memory_limit: str) -> None:
+        self.save(shown, default_blueprint=default_blueprint)
+
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", into_file)
+    make_video(tmp_path / "v.mp4", [0, 0.1], (720, 1280), picture=noise)
+    words = ("--view", "--write", "rrd", "--metric-source", metric)
+    assert run(tmp_path / "v.mp4", *words) == ALL
+    scale = "median_depth" if metric == "none" else "median_depth_m"
+    expected = {"/camera", "/camera/image", "/camera/depth", "/points", f"/scores/{scale}"}
+    assert expected <= entities(shown) and expected <= entities(tmp_path / "v_depth.rrd")
+
+
+def test_a_viewer_that_is_closed_does_not_end_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    answers = iter([True])
+
+    def flush(self: Any, **_: Any) -> None:
+        if not next(answers, False):
+            raise RuntimeError("no connection\nand details")
+
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda self, **_: None)
+    monkeypatch.setattr(rerun.RecordingStream, "flush", flush)
+    make_video(tmp_path / "v.mp4", [0, 0.1])
+    assert run(tmp_path / "v.mp4", "--view") == ALL
+    assert "the Rerun viewer was closed before the end" in capsys.readouterr().err
+    assert len(frames_of(tmp_path / "v_depth.mp4")) == 2
+    assert run(tmp_path / "v.mp4", "--view", "--overwrite") == UNUSABLE  # it never answers
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told.endswith("cannot be opened (no connection); it needs a display")
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
