@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | lint | coverage | bench | gpu-train    (see README.md)
+# make setup | demo | test | test-fast | lint | coverage | bench | wheel | gpu-train    (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test test-fast coverage lint bench gpu-train clean
+.PHONY: setup demo test test-fast coverage lint bench wheel gpu-train clean
 
 setup: $(READY)
 
@@ -41,5 +41,12 @@ bench: $(READY)
 gpu-train: $(READY)
 	$(BIN)/python benchmarks/gpu_train.py $(GPU_TRAIN)
 
+wheel:
+	rm -rf dist build
+	$(PYTHON) -m venv $(VENV)-wheel
+	$(VENV)-wheel/bin/python -m pip install --quiet build twine
+	$(VENV)-wheel/bin/python -m build --outdir dist .
+	$(VENV)-wheel/bin/python -m twine check --strict dist/*
+
 clean:
-	rm -rf $(VENV) build install log out
+	rm -rf $(VENV) $(VENV)-wheel dist build install log out

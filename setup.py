@@ -23,5 +23,6 @@ setup(
         (f"{SHARE}/config", files("config")),
         (f"{SHARE}/config/cameras", files("config/cameras")),
         (f"{SHARE}/launch", files("launch")),
+        (f"{SHARE}/bags/demo", files("bags/demo")),
     ],
 )

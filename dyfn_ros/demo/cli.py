@@ -24,6 +24,7 @@ from dyfn_core.evaluation.report.pictures import draw_cloud, encode_picture
 from dyfn_core.evaluation.report.sequence import sequence_sections, variants_of
 from dyfn_core.evaluation.report.variants import headline
 from dyfn_core.evaluation.sequence import SequenceEvaluation, curve_picture, score_table
+from dyfn_core.extras import missing
 from dyfn_ros.demo.node_process import NODE_COMMAND, LiveError, NodeProcess
 from dyfn_ros.demo.odometry import RecordedOdometry, read_odometry
 from dyfn_ros.node.environment import prepare_environment
@@ -38,6 +39,7 @@ BASE, DYFN, MOVING = "base", "DyFN", "DyFN + odometry"
 FILES = {BASE: "base", DYFN: "dyfn", MOVING: "odometry"}  # in the order of the table
 POSE_PATIENCE = 1.0  # seconds that the node waits for the pose of an image
 CLOUD_SIZE = (240, 320)
+DEMO = "bags/demo"
 DOMAINS = 100  # DDS domains whose ports are below the ephemeral range
 
 
@@ -65,8 +67,8 @@ def parser() -> argparse.ArgumentParser:
         "recording",
         nargs="?",
         default=argparse.SUPPRESS,  # another default would overwrite what --recording says
-        help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder (default: bags/demo of the "
-        "source tree)",
+        help="rosbag2 folder, .mcap, .db3 or .bag file, RGB-D folder (default: bags/demo, "
+        "which is installed too)",
     )
     renamed(parser, "--recording", recording, "RECORDING without an option's name")
     parser.add_argument(
@@ -96,9 +98,10 @@ def parse(arguments: Sequence[str] | None = None) -> DemoOptions:
 
 
 def default_recording() -> Path:
-    """bags/demo here, else in the source tree."""
-    here = Path("bags/demo")
-    return here if here.exists() else Path(__file__).resolve().parents[2] / here
+    """bags/demo here, else of the source tree or of the installation."""
+    above = [Path(), *Path(__file__).resolve().parents]
+    places = [place / name for place in above for name in (DEMO, f"share/dyfn_ros/{DEMO}")]
+    return next((place for place in places if place.exists()), Path(DEMO))
 
 
 @dataclass(frozen=True)
@@ -302,11 +305,7 @@ def main(arguments: Sequence[str] | None = None, command: Sequence[str] = NODE_C
         print(f"dyfn-demo: {error}", file=sys.stderr)
         return UNUSABLE
     except ImportError as error:
-        print(
-            f"dyfn-demo: ROS 2 is not available ({error}): source its setup file, or install this "
-            "package with its `ros` extra",
-            file=sys.stderr,
-        )
+        print(f"dyfn-demo: {missing(error)}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
         print("dyfn-demo: interrupted", file=sys.stderr)

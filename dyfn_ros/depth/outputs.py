@@ -12,10 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_core.data.files import needed
-from dyfn_core.data.frames import DataError
 from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
 from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.extras import missing
 from dyfn_core.files import OutputError, finished_file, write_text
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.prediction import Prediction
@@ -201,12 +200,10 @@ def _check_libraries(kinds: tuple[str, ...], view: bool) -> None:
 
 def _library() -> Any:
     try:
-        return needed("OpenEXR", Path("--write exr"))
-    except DataError as error:
-        raise OutputError(
-            "writing .exr needs OpenEXR: install this package with its `datasets` extra: "
-            "pip install 'dyfn_ros[datasets]'"
-        ) from error
+        import OpenEXR
+    except ImportError as error:
+        raise OutputError(f"writing .exr needs OpenEXR: {missing(error)}") from error
+    return OpenEXR
 
 
 def _exr(prediction: Prediction[np.ndarray], path: Path) -> bytes:

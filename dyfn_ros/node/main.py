@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
+from dyfn_core.extras import missing
 from dyfn_ros.node.end_request import EndRequest
 from dyfn_ros.node.environment import prepare_environment
 
@@ -26,6 +27,9 @@ def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> 
         from dyfn_ros.node.process import run
 
         code = run(sys.argv if args is None else list(args), load, end)
+    except ModuleNotFoundError as error:
+        print(f"stream_depth: {missing(error)}", file=sys.stderr)
+        end.leave(1)
     except Exception:
         traceback.print_exc()
         end.leave(1)

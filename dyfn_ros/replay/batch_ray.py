@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from dyfn_core.extras import missing
 from dyfn_core.files import OutputError
 from dyfn_ros.replay.jobs import CRASHED, BatchJob, Outcome, Runner, outcome_of
 from dyfn_ros.replay.run import ModelLoader
@@ -23,9 +24,7 @@ def ray_runner(address: str, jobs: int = 1) -> Runner:
     try:
         import ray
     except ImportError as error:
-        raise OutputError(
-            f"--ray needs Ray ({error}): install this package with its `ray` extra"
-        ) from error
+        raise OutputError(f"--ray needs Ray: {missing(error)}") from error
 
     def run(waiting: Sequence[BatchJob], loader: ModelLoader) -> Iterator[tuple[BatchJob, Outcome]]:
         if not waiting:

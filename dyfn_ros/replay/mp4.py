@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from dyfn_core.extras import missing
 from dyfn_core.files import OutputError, finished_file
 
 CODEC = "libx264"
@@ -22,10 +23,7 @@ def load_av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise OutputError(
-            f"writing a video needs PyAV ({error}): install this package with its `video` extra: "
-            "pip install 'dyfn_ros[video]'"
-        ) from error
+        raise OutputError(f"writing a video needs PyAV: {missing(error)}") from error
     return av
 
 

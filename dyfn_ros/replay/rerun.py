@@ -11,6 +11,7 @@ import numpy as np
 from typing_extensions import Self
 
 from dyfn_core.evaluation.report.pictures import encode_picture
+from dyfn_core.extras import missing
 from dyfn_core.files import OutputError
 from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.frame_scores import FrameScore
@@ -27,9 +28,7 @@ def load_rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise OutputError(
-            f"writing .rrd needs rerun-sdk ({error}): install this package with its `rerun` extra"
-        ) from error
+        raise OutputError(f"the Rerun viewer and .rrd need rerun-sdk: {missing(error)}") from error
     return rerun
 
 

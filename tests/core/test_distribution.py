@@ -55,3 +55,28 @@ def test_extras_name_extras_that_exist(project: dict[str, Any]) -> None:
     (everything,) = extras["all"]
     named = everything.removeprefix("dyfn_ros[").removesuffix("]").split(",")
     assert {*named, "test", "all"} == set(extras)  # `dev` has `test`
+
+
+def test_the_demo_recording_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """setup.py ships it, and an installation finds it from anywhere."""
+    from dyfn_ros.demo import cli
+
+    assert '"bags/demo"' in (ROOT / "setup.py").read_text(encoding="utf-8")
+    share = tmp_path / "share/dyfn_ros/bags/demo"
+    share.mkdir(parents=True)
+    elsewhere = tmp_path / "lib/python3.12/site-packages/dyfn_ros/demo/cli.py"
+    monkeypatch.setattr(cli, "__file__", str(elsewhere))
+    monkeypatch.chdir(tmp_path / "share")
+    assert cli.default_recording() == share
+
+
+def test_pixi_has_the_packages_version_floor(project: dict[str, Any]) -> None:
+    toml = pytest.importorskip("tomllib", reason="Python 3.11 reads TOML")
+    pixi = toml.loads((ROOT / "pixi.toml").read_text(encoding="utf-8"))
+    needed = dict(text.split(">=") for text in project["project"]["dependencies"] if ">=" in text)
+    assert pixi["dependencies"]["pytorch"] == f">={needed['torch']}"
+    extras = project["project"]["optional-dependencies"]
+    (ours,) = pixi["pypi-dependencies"].values()
+    assert set(ours["extras"]) <= set(extras)
+    tasks = {words.split()[0] for words in pixi["tasks"].values()}
+    assert tasks <= set(project["project"]["scripts"])

@@ -10,13 +10,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-_WORDS = {"prediction", "quantities", "files", "threads", "argument_types"}
+_WORDS = {"prediction", "quantities", "files", "threads", "argument_types", "extras"}
 _MODELS = _WORDS | {"geometry", "models"}
 # Room -> the rooms of the same package that it may import. A room is the first name below the
 # package. docs/pictures/rooms.svg is drawn from this table: python -m tests.support.rooms_picture
 ROOMS: dict[str, dict[str, set[str]]] = {
     "dyfn_core": {
-        **{word: set() for word in ("quantities", "files", "threads", "argument_types")},
+        **{word: set() for word in ("quantities", "files", "threads", "argument_types", "extras")},
         "geometry": _WORDS - {"prediction"},
         "prediction": {"geometry", "quantities"},
         "metric": _WORDS | {"geometry"},
@@ -50,8 +50,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
 # The rooms that stand above all others of their package.
 ABOVE = {
     "dyfn_core": {"cli"},
-    "dyfn_ros": {"demo"},
-    "dyfn_worlds": {"cli", "generate", "casting"},
+    "dyfn_ros": {"demo", "commands"},
+    "dyfn_worlds": {"cli", "commands", "generate", "casting"},
 }
 # Packages from outside -> where they may be imported: "package" or "package.room".
 RCLPY, BAGS = ("rclpy",), ("rosbags", "mcap", "apsw")

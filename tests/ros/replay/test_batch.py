@@ -240,7 +240,7 @@ def test_ray_that_is_missing_is_named(
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     assert run(tmp_path / "out", walks, "--ray", "local") == UNUSABLE
-    assert "with its `ray` extra" in capsys.readouterr().err
+    assert "ray is not installed: pip install 'dyfn_ros[ray]'" in capsys.readouterr().err
 
 
 def test_the_interval_is_seeded_and_covers_the_mean() -> None:

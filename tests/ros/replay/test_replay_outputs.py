@@ -232,7 +232,7 @@ def test_rerun_that_is_missing_is_named(
     record(tmp_path / "walk", facing_a_wall(1))
     arguments = [str(tmp_path / "walk"), "--out", str(tmp_path / "out"), "--model", "tiny"]
     assert main([*arguments, "--write", "rrd"], load_tiny) == UNUSABLE
-    assert "with its `rerun` extra" in capsys.readouterr().err
+    assert "rerun is not installed: pip install 'dyfn_ros[rerun]'" in capsys.readouterr().err
 
 
 @contextmanager

@@ -1,0 +1,13 @@
+"""Entry points of the commands: imports of an extra that is missing end in one line."""
+
+from dyfn_core.extras import start
+
+
+def train() -> int:
+    """`dyfn-train`."""
+    return start("dyfn-train", "dyfn_core.cli.train")
+
+
+def evaluate() -> int:
+    """`dyfn-eval`."""
+    return start("dyfn-eval", "dyfn_core.cli.eval")
