@@ -23,9 +23,9 @@ from dyfn_core.scoring.protocols import SequenceScorer
 SCORE_NOTE = (
     "AbsRel: mean |d - p| / d, lower is better. delta1: share within 25%, higher is better. "
     "Image: each frame aligned to the truth by its own scale and shift; video: one scale and "
-    "shift for the whole sequence; metric: no alignment, over the frames in metres. Scale spread: "
-    "standard deviation of the log of each frame's own scale. Two controls know nothing of the "
-    "image: a vertical ramp and a constant."
+    "shift for the whole sequence; metric: no alignment, over the frames in metres. Drift: "
+    "standard deviation of the log of each frame's true over predicted depth, as aligned for "
+    "video. Two controls know nothing of the image: a vertical ramp and a constant."
 )
 WORST_NOTE = (
     "Worst by AbsRel under the video protocol, one of each stretch of the recording. The pictures "
