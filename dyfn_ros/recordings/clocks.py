@@ -78,7 +78,10 @@ def clock_offset(
     if len(rare) < MIN_PAIRS or not _rises(rare.logs) or not _rises(often.logs):
         return None
     sign = 1 if rare is others else -1
-    together = often.stamps[_nearest(often.logs, rare.logs)]
+    near = _nearest(often.logs, rare.logs)
+    if np.median(np.abs(often.logs[near] - rare.logs)) > _period(rare.logs):
+        return None  # one topic was written after the other: nothing is recorded together
+    together = often.stamps[near]
     differences = sign * (rare.stamps - together)
     half_period = max(_period(images.stamps), _period(others.stamps)) / 2
     least = least_ns if apart else max(half_period, least_ns)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import zlib
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
+
+import numpy as np
 
 from dyfn_ros.recordings.storage.base import Recorded
 
@@ -107,6 +110,88 @@ class _Queue:
     def rest(self) -> Iterator[Match]:
         while self._images:
             yield self.take()
+
+
+def far_apart(first: Sequence[tuple[bool, int]]) -> bool:
+    """Whether images and depths of one stamp are too far apart in the file for match_depth.
+
+    Args:
+        first: Whether it is a depth, and the stamp, of the first messages in order of recording.
+    """
+    depths, images = (
+        np.array([(at, s) for at, (depth, s) in enumerate(first) if depth is wanted]).reshape(-1, 2)
+        for wanted in (True, False)
+    )
+    if not len(depths) or not len(images):
+        return True
+
+    def ahead(ones: np.ndarray, others: np.ndarray) -> int:
+        """Of `ones`, the most that come before one of `others` though their stamps are later."""
+        before, after = ones[None], others[:, None]
+        both = (before[..., 0] < after[..., 0]) & (before[..., 1] > after[..., 1])
+        return int(both.sum(1).max())
+
+    return max(ahead(images, depths), ahead(depths, images)) > MAX_WAITING // 2
+
+
+def match_far(
+    images: Iterable[Stamped], depths: Callable[[], Iterator[Stamped]], tolerance_ns: int
+) -> Iterator[Match]:
+    """As match_depth, wherever in the file the depths are; they are read twice or more.
+
+    Args:
+        images: In order of recording.
+        depths: Reads all depths from the first on.
+        tolerance_ns: Largest distance of the stamps.
+    """
+    index = _Index(depths)
+    waiting: Stamped | None = None
+    repeated = False  # the image that waits has the stamp of another one
+    for image in images:
+        if waiting is not None:
+            same = _differ(waiting, image)
+            yield index.match(waiting, tolerance_ns, repeated or same)
+            repeated = same
+        waiting = image
+    if waiting is not None:
+        yield index.match(waiting, tolerance_ns, repeated)
+
+
+class _Index:
+    """The depths of a recording by their stamps; 24 bytes of each are kept."""
+
+    def __init__(self, depths: Callable[[], Iterator[Stamped]]) -> None:
+        self._read = depths
+        marks = [(depth.stamp_ns, zlib.crc32(depth.recorded.data)) for depth in depths()]
+        stamps = np.array([stamp for stamp, _ in marks], np.int64)
+        self._order = np.argsort(stamps, kind="stable")
+        self._stamps = stamps[self._order]
+        self._marks = np.array([mark for _, mark in marks], np.uint32)[self._order]
+        self._reader: Iterator[Stamped] = iter(())
+        self._next = len(marks)  # place in the file of what the reader gives next
+
+    def match(self, image: Stamped, tolerance_ns: int, repeated: bool) -> Match:
+        if not len(self._stamps):
+            return Match(image)
+        place = int(np.searchsorted(self._stamps, image.stamp_ns))
+        beside = range(max(place - 1, 0), min(place + 1, len(self._stamps)))
+        best = min(beside, key=lambda at: abs(int(self._stamps[at]) - image.stamp_ns))
+        distance = int(self._stamps[best]) - image.stamp_ns
+        if abs(distance) > tolerance_ns:
+            return Match(image, None, distance)
+        equal = self._stamps == self._stamps[best]
+        if repeated or len(np.unique(self._marks[equal])) > 1:
+            return Match(image, None, distance, ambiguous=True)
+        return Match(image, self._at(int(self._order[best])), distance)
+
+    def _at(self, wanted: int) -> Stamped:
+        if wanted < self._next:
+            self._reader, self._next = self._read(), 0
+        for depth in self._reader:
+            self._next += 1
+            if self._next > wanted:
+                return depth
+        raise AssertionError("the depths are read the same each time")
 
 
 def _differ(one: Stamped, other: Stamped) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +18,14 @@ from dyfn_ros.messages.images import decode_image
 from dyfn_ros.messages.rectify import LensError, PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
 from dyfn_ros.recordings.clocks import StampedTimes, clock_offset, offset_text, side_of
-from dyfn_ros.recordings.depth_matching import Match, Stamped, match_depth
+from dyfn_ros.recordings.depth_matching import (
+    MAX_WAITING,
+    Match,
+    Stamped,
+    far_apart,
+    match_depth,
+    match_far,
+)
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.ground_truth import GroundTruth
@@ -50,7 +59,6 @@ class BagRecording:
         self._truth = GroundTruth(transform, self._assumed, quantity, depth_scale)
         self._log_time = stamps == "log"
         self._depth_offset_ns = round(depth_offset * 1e9)
-        self._known_losses = list(storage.losses)  # whatever of the recording is read
         self._matched = 0  # images with a depth
         self._offsets: list[int] = []  # of the nearest depth beyond the tolerance, ns
         self._image_times, self._depth_times = StampedTimes(), StampedTimes()
@@ -79,8 +87,7 @@ class BagRecording:
                     index += 1
                     yield frame
         finally:  # also when no more frames are wanted
-            lost = [*self._known_losses, *self._storage.losses]
-            self.notes.losses.update(dict.fromkeys(lost, 1))
+            self.notes.losses.update(self._storage.losses)
 
     def doubts(self) -> list[str]:
         """See Recording."""
@@ -121,21 +128,36 @@ class BagRecording:
 
     def _matches(self) -> Iterator[Match]:
         self._matched, self._offsets = 0, []
+        image, depth = self.topics.image, self.topics.depth
+        if depth is None:
+            self._image_times, self._depth_times = StampedTimes(), StampedTimes()
+            return (Match(image) for image in self._events({image}))
+        far = self._far_apart(image, depth)
         self._image_times, self._depth_times = StampedTimes(), StampedTimes()
-        if self.topics.depth is None:
-            return (Match(image) for image in self._events())
-        return match_depth(self._events(), self.topics.depth, self._tolerance_ns)
+        if far:
+            images, depths = self._events({image}), partial(self._events, {depth})
+            return match_far(images, depths, self._tolerance_ns)
+        return match_depth(self._events({image, depth}), depth, self._tolerance_ns)
+
+    def _far_apart(self, image: str, depth: str) -> bool:
+        """Whether the first messages say so; what is wrong with them is noted later."""
+        notes, self.notes = self.notes, Notes()
+        first = islice(self._events({image, depth}), 2 * MAX_WAITING)
+        far = far_apart([(one.recorded.topic == depth, one.stamp_ns) for one in first])
+        self.notes = notes
+        return far
 
     def _first(self, topic: str | None) -> Recorded | None:
         return next(iter(self._storage.messages([topic] if topic else [])), None)
 
-    def _events(self) -> Iterator[Stamped]:
+    def _events(self, wanted: set[str]) -> Iterator[Stamped]:
         """Images and depths, each with the CameraInfo of its time, in log-time order."""
         topics = self.topics
-        sources = {topics.image: topics.camera_info, topics.depth: topics.depth_info}
+        both = {topics.image: topics.camera_info, topics.depth: topics.depth_info}
+        sources = {topic: info for topic, info in both.items() if topic in wanted}
         infos: dict[str, Recorded] = {}
-        wanted = {topic for pair in sources.items() for topic in pair if topic}
-        for recorded in self._messages(wanted):
+        read = {topic for pair in sources.items() for topic in pair if topic}
+        for recorded in self._messages(read):
             if recorded.topic not in sources:
                 infos[recorded.topic] = recorded
                 continue
@@ -145,7 +167,7 @@ class BagRecording:
 
     def _messages(self, wanted: set[str]) -> Iterator[Recorded]:
         """Those of the storage; of compressed video its pictures."""
-        if not is_video(self._first(self.topics.image)):
+        if self.topics.image not in wanted or not is_video(self._first(self.topics.image)):
             yield from self._storage.messages(wanted)
             return
         video = VideoTopic(self.topics.image, lambda reason: self.notes.losses.update([reason]))

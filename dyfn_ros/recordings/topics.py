@@ -30,6 +30,7 @@ _DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$
 _OF_DEPTH = re.compile(r"depth|disparity")
 # A namespace, not the name of a picture.
 _COLOUR_SPACE = re.compile(r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/")
+_REGISTERED = re.compile(r"aligned|registered")
 _OTHER_LIGHT = re.compile(
     r"infra|thermal|lwir|lepton|amplitude|intensity|confidence|(?:^|[/_])ir_?\d*(?:[/_]|$)"
 )
@@ -195,7 +196,8 @@ def _named(path: Path, kinds: dict[str, str], name: str | None, types: set[str])
     for known in (name, f"{name}/compressed", f"{name}/compressedDepth", f"{name}/ffmpeg"):
         if kinds.get(known) in types:
             return known
-    expected = " or ".join(sorted(types))
+    ours_first = sorted(types, key=lambda kind: (not kind.startswith("sensor_msgs"), kind))
+    expected = " or ".join(ours_first)
     if name in kinds:
         raise RecordingError(f"{path}: topic {name} is {kinds[name]}, expected {expected}")
     raise RecordingError(
@@ -266,10 +268,12 @@ def _first(storage: Storage, name: str) -> Any:
 
 
 def _nearest(depths: list[str], image: str) -> list[str]:
-    """The depths in the namespace of the image when that is one, else all."""
+    """The depths in the namespace of the image when that is one, else those that are registered
+    by their name when that is one, else all."""
     space = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/"
     near = [name for name in depths if name.startswith(space)]
-    return near if len(near) == 1 else depths
+    registered = [name for name in depths if _REGISTERED.search(name.lower())]
+    return next((found for found in (near, registered) if len(found) == 1), depths)
 
 
 def _one_of_twins(storage: Storage, names: list[str]) -> list[str]:

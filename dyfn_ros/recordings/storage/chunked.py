@@ -62,11 +62,12 @@ class ChunkedFile(ABC):
         except DAMAGE:
             self._index = None
         self.topics = self._index.topics if self._index else count_topics(self._scan())
+        self._known = self._lost.sentences  # however little of the messages is read later
 
     @property
     def losses(self) -> list[str]:
         """See Storage."""
-        return self._lost.sentences
+        return [*dict.fromkeys([*self._known, *self._lost.sentences])]
 
     def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
         """See Storage."""

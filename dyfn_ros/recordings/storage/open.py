@@ -16,7 +16,7 @@ import zstandard
 from dyfn_core.data.files import hidden
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.storage.base import DAMAGE, Recorded, Storage, Topic, reason
-from dyfn_ros.recordings.storage.heads import kind_by_head, strange_head
+from dyfn_ros.recordings.storage.heads import NAMES, kind_by_head, strange_head
 from dyfn_ros.recordings.storage.mcap import McapFile
 from dyfn_ros.recordings.storage.rosbag1 import Bag1File
 from dyfn_ros.recordings.storage.sqlite import SqliteFile
@@ -104,7 +104,7 @@ def open_storage(path: str | Path) -> Storage:
 
 
 def _is_file(path: Path) -> bool:
-    return _plain_name(path).endswith(SUFFIXES)
+    return _plain_name(path).lower().endswith(SUFFIXES)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -220,17 +220,19 @@ def _place(folder: Path, name: str) -> Path | None:
 
 
 def _plain_name(path: Path) -> str:
-    return path.stem if path.suffix in PACKED else path.name
+    return path.stem if path.suffix.lower() in PACKED else path.name
 
 
 def _open_file(path: Path) -> Storage:
-    if not _is_file(path):
-        raise RecordingError(f"{path}: expected {EXPECTED}")
     if path.stat().st_size == 0:
         raise RecordingError(f"{path} is empty")
-    packed = path.suffix in PACKED
-    suffix = kind_by_head(path, packed) or path.suffix
-    if packed and suffix == path.suffix:
+    own = path.suffix.lower()
+    packed = own in PACKED
+    suffix = kind_by_head(path, packed) or own
+    if not _is_file(path):
+        hint = f"; it begins as {NAMES[suffix]} does: name it so" if suffix in NAMES else ""
+        raise RecordingError(f"{path}: expected {EXPECTED}{hint}")
+    if packed and suffix == own:
         return UnpackedStorage(path)
     try:
         storage = READERS[suffix](path)

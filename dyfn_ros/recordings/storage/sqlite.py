@@ -34,11 +34,12 @@ class SqliteFile:
             self.topics = self._count()
         except DAMAGE:
             self.topics = count_topics(r for _, r in self._salvage((-_LAST, -_LAST), None))
+        self._known = self._lost.sentences  # however little of the messages is read later
 
     @property
     def losses(self) -> list[str]:
         """See Storage."""
-        return self._lost.sentences
+        return [*dict.fromkeys([*self._known, *self._lost.sentences])]
 
     def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
         """See Storage."""

@@ -167,6 +167,37 @@ def test_what_is_no_recording_is_told_for_what_it_is(
         open_recording(tmp_path / f"walk{suffix}")
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("walk.zip", zipped(), "walk.zip is no recording but a zip archive: unpack it"),
+        ("walk.tar.gz", gzip.compress(tarred()), "but a gzip file: unpack it"),
+        ("walk.tar", tarred(), "but a tar archive: unpack it"),
+        ("download", b"<html><body>Sign in</body></html>", "but a web page, it begins with"),
+        ("walk", b"\x89MCAP0\r\n" + bytes(100), "it begins as an MCAP file does: name it so"),
+        ("walk.rosbag", b"#ROSBAG V2.0\n" + bytes(9), "it begins as a ROS 1 bag .2.0. does"),
+        ("walk.dat", b"some text", "expected a rosbag2 folder, an .mcap, .db3 or .bag file"),
+        ("walk.mcap", b"", "walk.mcap is empty"),
+    ],
+)
+def test_files_with_other_names_are_told_for_what_they_are(
+    tmp_path: Path, name: str, content: bytes, said: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=said):
+        open_recording(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["zstd.mcap", "plain.bag", "packed.mcap.zstd"])
+def test_suffixes_in_capitals_are_read(tmp_path: Path, kind: str) -> None:
+    path = make(tmp_path, kind, COUNT)
+    named = path.rename(tmp_path / path.name.upper())
+    assert check(named) == []
+    (tmp_path / "bag").mkdir()
+    named.rename(tmp_path / "bag" / named.name)
+    assert check(tmp_path / "bag") == []
+
+
 def test_a_pointer_among_the_parts_is_a_loss_that_says_so(tmp_path: Path) -> None:
     bag = folder(tmp_path / "bag", HALVES, [*HALVES])
     (bag / "b.mcap").write_bytes(POINTER)

@@ -169,9 +169,9 @@ def test_several_cameras_are_listed_and_one_can_be_chosen(tmp_path: Path) -> Non
 def test_depths_of_no_camera_in_particular_are_listed(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "bag") as writer:
         writer.write_image("/camera/color/image", picture(0), 1, "camera")
-        for name in ("depth", "aligned_depth"):
+        for name in ("depth", "front_depth"):
             writer.write_depth(f"/camera/{name}/image", truth(0), 1, "camera", "16UC1")
-    with pytest.raises(RecordingError, match=r"--depth-topic .*: /camera/aligned_.*, /camera/dep"):
+    with pytest.raises(RecordingError, match=r"--depth-topic .*: /camera/depth.*, /camera/front"):
         open_recording(tmp_path / "bag")
 
 

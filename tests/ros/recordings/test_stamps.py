@@ -195,3 +195,55 @@ def image_of(index: int, at: int) -> Any:
 
 def depth_of(index: int, at: int) -> Any:
     return image_message(depth(index), "32FC1", at, "camera")
+
+
+FAR = 40  # more than wait for each other in the order of recording
+
+
+@pytest.mark.parametrize("order", ["images first", "depths first", "late depths", "early depths"])
+def test_images_and_depths_of_one_stamp_may_be_anywhere_in_the_file(
+    tmp_path: Path, order: str
+) -> None:
+    late = {"late depths": 35, "early depths": -35}.get(order, 1000)
+    late = -late if order == "depths first" else late
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for index in range(FAR):
+            at = SECOND + index * STEP
+            for topic, message, place in (
+                ("/image", image_of(index, at), index),
+                ("/depth", depth_of(index, at), index + late),
+            ):
+                writer.write(topic, IMAGE, message, SECOND + 1_000_000 * place)
+    recording = open_recording(tmp_path / "bag")
+    for _ in range(2):
+        assert numbers(recording.frames()) == [*range(FAR)]
+        assert not recording.notes.warnings and not recording.notes.losses
+    assert recording.topics.depth == "/depth"
+
+
+def test_equal_stamps_far_apart_in_the_file_score_nothing(tmp_path: Path) -> None:
+    """Images 3 and 4 have one stamp, and so have depths 7 and 8, and 9 is there twice."""
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for index in range(FAR):
+            at = SECOND + (index - (index == 4)) * STEP
+            writer.write("/image", IMAGE, image_of(index, at), SECOND + index)
+        for index in range(FAR):
+            at = SECOND + (index - (index == 8)) * STEP
+            for _ in range(1 + (index == 9)):
+                writer.write("/depth", IMAGE, depth_of(index, at), 2 * SECOND + index)
+    recording = open_recording(tmp_path / "bag")
+    expected = [None if index in (3, 4, 7, 8) else index for index in range(FAR)]
+    assert numbers(recording.frames()) == expected
+    assert recording.notes.warnings[AMBIGUOUS] == 3
+    assert recording.notes.warnings["/depth: no depth at an image's stamp"] == 1
+    assert recording.doubts() == []
+
+
+def test_images_that_were_recorded_in_reverse_have_their_depth(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        for place, index in enumerate(reversed(range(FAR))):
+            at = SECOND + index * STEP
+            writer.write("/image", IMAGE, image_of(index, at), SECOND + place)
+            writer.write("/depth", IMAGE, depth_of(index, at), SECOND + place)
+    recording = open_recording(tmp_path / "bag")
+    assert numbers(recording.frames()) == [*reversed(range(FAR))]

@@ -103,6 +103,22 @@ def test_a_truncated_recording_is_read_up_to_the_damage(tmp_path: Path, kind: st
     assert losses and any(str(tmp_path) in loss for loss in losses)
 
 
+@pytest.mark.parametrize("kind", ["zstd.mcap", "unchunked.mcap", "plain.bag", "sqlite3"])
+def test_what_is_known_to_be_lost_counts_however_few_frames_are_read(
+    tmp_path: Path, kind: str
+) -> None:
+    path = make(tmp_path, kind, 20)
+    file = largest_file(path)
+    file.write_bytes(cut(file.read_bytes()))
+    recording = open_recording(path)
+    with closing(recording.frames()) as frames:
+        next(frames)
+    few = [*recording.notes.losses]
+    assert few
+    assert len(list(recording.frames())) > 1
+    assert [*recording.notes.losses] == few
+
+
 def overwrite(file: Path, place: float, value: bytes) -> None:
     data = bytearray(file.read_bytes())
     start = int(len(data) * place)

@@ -62,6 +62,19 @@ def write(path: Path, topics: dict[str, str]) -> Path:
         ("/rgb/image", "/depth/image", "16UC1", {"/ir/image": "16UC1"}),
         ("/rgb/image", "/depth/image", "16UC1", {"/thermal_camera/image": "16UC1"}),
         ("/rgb/image", "/depth/image", "32FC1", {"/confidence/confidence_map": "32FC1"}),
+        (
+            "/camera/color/image_raw",
+            "/camera/aligned_depth_to_color/image_raw",
+            "16UC1",
+            {"/camera/depth/image_rect_raw": "16UC1"},
+        ),
+        (
+            "/camera/rgb/image_color",
+            "/camera/depth_registered/image",
+            "32FC1",
+            {"/camera/depth/image": "32FC1"},
+        ),
+        ("/cam/infra1/image_rect_raw", "/cam/depth/image_rect_raw", "16UC1", {}),
     ],
 )
 def test_image_and_depth_are_told_apart(
