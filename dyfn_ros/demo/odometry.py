@@ -13,6 +13,7 @@ from dyfn_core.metric.pose_history import NoPose
 from dyfn_core.metric.pose_limits import PoseLimits
 from dyfn_ros.messages.odometry import frame_name, stamp_of
 from dyfn_ros.messages.transforms import TransformBuffer, TransformError
+from dyfn_ros.recordings.image_recording import is_image_recording
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
 from dyfn_ros.recordings.storage.base import Storage
 from dyfn_ros.recordings.storage.open import open_storage
@@ -69,6 +70,8 @@ def read_odometry(path: Path, frame_id: str) -> tuple[RecordedOdometry | None, s
     """
     if path.is_dir() and is_rgbd_folder(path):
         return None, f"{path} is an RGB-D folder, which holds no odometry topic"
+    if is_image_recording(path):
+        return None, f"{path} holds pictures, and no odometry topic"
     storage = open_storage(path)
     topics = sorted(n for n, t in storage.topics.items() if t.kind == ODOMETRY and t.count)
     if len(topics) != 1:

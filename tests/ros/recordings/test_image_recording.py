@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from dyfn_ros.demo.odometry import read_odometry
 from dyfn_ros.recordings.open import image_topics, open_recording
 from dyfn_ros.recordings.poses import PoseError, open_poses
 from dyfn_ros.recordings.video_file import video_frames
@@ -35,6 +36,8 @@ def test_a_video_is_a_recording_with_its_times(tmp_path: Path) -> None:
     assert image_topics(tmp_path / "v.MP4") == [None]
     with pytest.raises(PoseError, match="holds pictures"):
         open_poses(tmp_path / "v.MP4", "camera")
+    nothing, why = read_odometry(tmp_path / "v.MP4", "camera")
+    assert nothing is None and why.endswith("holds pictures, and no odometry topic")
 
 
 def test_a_folder_of_pictures_is_a_recording(tmp_path: Path) -> None:
