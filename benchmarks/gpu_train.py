@@ -25,6 +25,7 @@ from typing import Any
 import yaml
 
 from dyfn_core.models.checkpoints import load_model, save_model
+from dyfn_worlds.maps.quake import GameFiles
 
 ROOT = Path(__file__).resolve().parents[1]
 BASE_CONFIG = ROOT / "config/train_base_mini_real.yaml"
@@ -65,7 +66,8 @@ class Sizes:
 
 def renderers(art: Path, data: Path, workers: int, samples: int) -> list[list[str]]:
     """A command for each process: the kinds by their shares, each with seeds of its own."""
-    maps = any(art.rglob("*.pk3"))
+    archives = sorted(art.rglob("*.pk3"))
+    maps = bool(archives and GameFiles(archives).maps())
     kinds = [(f, o) for f, o, share in KINDS if maps or "maps" not in o for _ in range(share)]
     kinds = _spread(kinds, workers)
     commands = []
@@ -122,8 +124,16 @@ def base_command(options: argparse.Namespace, work: Path, seconds: float) -> lis
 def dyfn_command(
     options: argparse.Namespace, work: Path, base: Path, out: str, draws: int, steps: int
 ) -> list[str]:
-    """DyFN's run on walks that the base has not seen; all of them share one cache."""
-    roots = [str(p) for p in sorted((work / "data").glob("clips_*")) if any(p.glob("clips/*"))]
+    """DyFN's run on walks that the base has not seen; all runs share one cache.
+
+    Raises FileNotFoundError when there is no walk.
+    """
+    metas = (work / "data").glob("clips_*/clips/*/meta.json")  # of finished walks
+    roots = sorted({str(meta.parents[2]) for meta in metas})
+    if not roots:
+        raise FileNotFoundError(
+            f"{work / 'data'}: no walk was finished in the time: more --minutes, fewer --samples"
+        )
     settings = {
         "base": str(base),
         "data": roots,

@@ -177,6 +177,8 @@ def pack_maps(files: RecordedFiles, path: Path, limit: int, rng: np.random.Gener
                 if name not in written:
                     archive.writestr(name, data)
                     written.add(name)
+    if not chosen:
+        path.unlink()
     return chosen
 
 

@@ -141,3 +141,4 @@ def test_a_packed_map_is_the_same_map_and_a_broken_one_is_left_out(
     np.testing.assert_array_equal(after.vertices, before.vertices)
     np.testing.assert_allclose(after.textures, before.textures, atol=3)  # JPEG
     assert pack_maps(files, tmp_path / "none.pk3", 500, rng) == []
+    assert not (tmp_path / "none.pk3").exists()

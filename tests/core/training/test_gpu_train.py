@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -43,8 +44,13 @@ def test_nothing_to_train_on_is_an_error(tmp_path: Path) -> None:
 
 
 def test_dyfn_learns_from_walks_alone_with_one_cache(tmp_path: Path) -> None:
+    unfinished = tmp_path / "data/clips_maps/clips/one"
+    unfinished.mkdir(parents=True)
+    with pytest.raises(FileNotFoundError, match="no walk was finished"):
+        gpu_train.dyfn_command(options(tmp_path), tmp_path, Path("moved"), "dyfn", 50, 20)
     for folder in ("clips_rooms/clips/one", "rooms_usual/frames/one", "base_walks_rooms/clips/one"):
         (tmp_path / "data" / folder).mkdir(parents=True)
+        (tmp_path / "data" / folder / "meta.json").touch()
     command = gpu_train.dyfn_command(
         options(tmp_path, "--device", "cpu"), tmp_path, Path("moved.safetensors"), "dyfn", 50, 20
     )
@@ -58,7 +64,8 @@ def test_dyfn_learns_from_walks_alone_with_one_cache(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("workers", [2, 5, 40])
 def test_every_renderer_has_seeds_of_its_own(tmp_path: Path, workers: int) -> None:
-    (tmp_path / "maps.pk3").touch()
+    with zipfile.ZipFile(tmp_path / "maps.pk3", "w") as archive:
+        archive.writestr("maps/one.bsp", "")
     commands = gpu_train.renderers(tmp_path, tmp_path / "data", workers, 4)
     seen = [worlds_parser().parse_args(command[3:]) for command in commands]
     assert len({job.seed for job in seen}) == workers
