@@ -79,10 +79,13 @@ def test_more_than_may_be_carried_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "picture.jpg").write_bytes(bytes(3_000_000))
-    tracked = gpu_train.check_size([])
-    monkeypatch.setattr(gpu_train, "BUDGET", tracked + 2e6)
+    code = gpu_train.check_size([], [])
+    assert 0.5e6 < code < 20e6
+    monkeypatch.setattr(gpu_train, "BUDGET", code + 2e6)
     with pytest.raises(ValueError, match=r"pack less art .*--megabytes"):
-        gpu_train.check_size([tmp_path])
+        gpu_train.check_size([], [tmp_path])
+    with pytest.raises(ValueError, match="MB to carry"):
+        gpu_train.check_size([gpu_train.START], [])
 
 
 def test_a_renderer_that_fails_is_told_with_its_log(tmp_path: Path) -> None:
