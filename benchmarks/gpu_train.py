@@ -30,7 +30,7 @@ from dyfn_worlds.maps.quake import GameFiles
 ROOT = Path(__file__).resolve().parents[1]
 BASE_CONFIG = ROOT / "config/train_base_mini_real.yaml"
 DYFN_CONFIG = ROOT / "config/train_dyfn_mini_more.yaml"
-START = ROOT / "dyfn_core/weights/dyfn-mini-7.safetensors"
+START = ROOT / "dyfn_core/weights/dyfn-mini-8.safetensors"
 BUDGET = 64e6  # bytes that may be carried: the code, two models, the art and the recordings
 NEEDED = ("dyfn_core", "dyfn_worlds", "config", "benchmarks")
 # of the whole time; the rest is for starting processes, averaging, moving and packing
@@ -225,7 +225,9 @@ def check_size(weights: Sequence[Path], folders: Sequence[Path]) -> float:
 def train(options: argparse.Namespace) -> dict[str, Any]:
     """The whole of it; returns what took how long, and how much was made."""
     began = time.monotonic()
-    report: dict[str, Any] = {"carried_megabytes": check_size([options.start, options.dyfn], _folders(options)) / 1e6}
+    report: dict[str, Any] = {
+        "carried_megabytes": check_size([options.start, options.dyfn], _folders(options)) / 1e6
+    }
     report["renderer"] = tell_renderer(options.device == "cpu")
     print(f"{report['renderer']} draws, {options.sizes.workers} processes", flush=True)
     work, whole = options.work, 60 * options.minutes

@@ -41,10 +41,11 @@ MODEL_TYPES: dict[str, type[GeometryModel]] = {
     "moge": MoGeModel,
 }
 BUNDLED = {
-    "dyfn-mini": "dyfn-mini.safetensors",
-    "dyfn-mini-5": "dyfn-mini.safetensors",  # the default by its version
+    "dyfn-mini": "dyfn-mini-8.safetensors",
+    "dyfn-mini-5": "dyfn-mini.safetensors",  # the default before
     "dyfn-mini-6": "dyfn-mini-6.safetensors",
     "dyfn-mini-7": "dyfn-mini-7.safetensors",
+    "dyfn-mini-8": "dyfn-mini-8.safetensors",  # the default by its version
 }
 HUB_FILES = {
     "shawlyu/dyfn": "DyFN.pt",
