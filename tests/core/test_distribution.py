@@ -24,6 +24,8 @@ def test_ros_and_python_packages_have_one_version(project: dict[str, Any]) -> No
     manifest = ElementTree.parse(ROOT / "package.xml").getroot()
     assert manifest.findtext("version") == project["project"]["version"]
     assert manifest.findtext("name") == project["project"]["name"]
+    assert manifest.findtext("url") == project["project"]["urls"]["Paper"]
+    assert [manifest.findtext("author")] == [one["name"] for one in project["project"]["authors"]]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
