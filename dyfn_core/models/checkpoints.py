@@ -47,6 +47,12 @@ BUNDLED = {
     "dyfn-mini-7": "dyfn-mini-7.safetensors",
     "dyfn-mini-8": "dyfn-mini-8.safetensors",  # the default by its version
 }
+# SHA-256 of the bundled files, which are checked when they are loaded.
+BUNDLED_SHA256 = {
+    "dyfn-mini-6.safetensors": "c42f9390e858be7998bf96bae6f76ed1eedde96a0fd2326055346a0c7fbf4294",
+    "dyfn-mini-7.safetensors": "43d8c84c699ce9bd794b78c60f2fb079f399e87457fa939b8825f0d8caafa9c1",
+    "dyfn-mini.safetensors": "69db69fa6c46167625f787b94deccf87b492c8b58ed993385304d190a4dec08a",
+}
 HUB_FILES = {
     "shawlyu/dyfn": "DyFN.pt",
     "depth-anything/depth-anything-v2-small": "depth_anything_v2_vits.pth",
@@ -95,7 +101,8 @@ def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> 
     Raises:
         FileNotFoundError: no such file; or no network, then saying what to download and where to
             put it.
-        CheckpointError: no checkpoint, or keys that do not fit, all listed.
+        CheckpointError: no checkpoint, or keys that do not fit, all listed; a bundled file with
+            other bytes than it was released with; weights that are not finite.
         ValueError: no such device.
 
     Example:
@@ -108,9 +115,18 @@ def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> 
         with as_file(files("dyfn_core") / "weights" / BUNDLED[name]) as path:
             if not path.exists():
                 raise FileNotFoundError(f"the bundled model {name!r} is not installed: no {path}")
+            _check_digest(path, BUNDLED_SHA256[BUNDLED[name]])
             return build_model(read_checkpoint(path), str(path)).to(device)
     path = _locate(name)
     return build_model(read_checkpoint(path), str(path)).to(device)
+
+
+def _check_digest(path: Path, expected: str) -> None:
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    if found != expected:
+        raise CheckpointError(
+            f"{path} is damaged: its SHA-256 is {found}, expected {expected}; install it again"
+        )
 
 
 def build_model(checkpoint: Checkpoint, source: str) -> GeometryModel:
@@ -162,7 +178,8 @@ def load_weights(
     """Put weights into a model of the same shape, in its dtype; all of them or none.
 
     official: the names are those of released files ("head.stabilizer.*").
-    Raises CheckpointError that lists every missing, unexpected and wrongly shaped key.
+    Raises CheckpointError that lists every missing, unexpected and wrongly shaped key, and those
+    whose values are not finite.
     """
     own = model.state_dict()
     expected = {_official_name(key) if official else key: value for key, value in own.items()}
@@ -177,6 +194,11 @@ def load_weights(
         f"wrong shape: {key} is {_shape(weights[key])}, expected {_shape(value)}"
         for key, value in expected.items()
         if key in weights and weights[key].shape != value.shape
+    ]
+    problems += [
+        f"not finite: {key} ({_shape(value)})"
+        for key, value in weights.items()
+        if value.is_floating_point() and not torch.isfinite(value).all()
     ]
     if problems:
         listed = "\n  ".join(problems)

@@ -79,7 +79,7 @@ class StreamOptions:
         STREAM,
         0,
         "Resolution inside the model; 0 is the model's own. A change resets the stream.",
-        range=(0, 100_000),
+        range=(0, 4096),
         live=True,
     )
     stamp_tolerance: float = option(

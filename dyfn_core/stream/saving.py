@@ -19,6 +19,7 @@ from dyfn_core.stream.stages import StreamStage
 from dyfn_core.stream.state_file import (
     SavedStream,
     StateFileError,
+    check_replaceable,
     load_stream,
     restore,
     save_stream,
@@ -106,7 +107,10 @@ class StateKeeper:
         stream.memory = now.memory
         notes = {"frame_id": now.settings.frame_id}
         try:
+            check_replaceable(_checked(path))
             save_stream(_checked(path), stream, self.fingerprint, notes=notes, **now.stages)
+        except StateFileError as error:
+            raise StateError(str(error)) from error
         except OutputError as error:
             raise StateError(f"{error}; an older file is kept") from error
         return f"saved {now.memory.frames} frames' memory to {path}"
@@ -122,8 +126,10 @@ class StateKeeper:
             self._check_camera(path, saved, settings)
             stream = settings.stream(self._model, saved.camera_matrix)
             restore(stream, saved)
-        except StateFileError as error:
+        except (StateError, StateFileError) as error:
             raise StateError(str(error)) from error
+        except Exception as error:  # a forged description: the right kinds in wrong places
+            raise StateError(f"{path} holds an unusable state: {error}") from error
         return Loaded(settings, stream, saved)
 
     def _check_camera(self, path: str, saved: SavedStream, settings: StreamSettings) -> None:
@@ -146,6 +152,19 @@ def _checked(path: str) -> Path:
     if not path:
         raise StateError("state_file is empty, expected the path of a file")
     return Path(path).expanduser()
+
+
+def check_folder(path: str, folder: str) -> None:
+    """Raises StateError when a state file is not in the folder, links followed."""
+    if not path:
+        return
+    if not folder:
+        raise StateError(
+            "no folder is configured for state files: give state_folder, or state_file, at start"
+        )
+    inside = Path(folder).expanduser().resolve()
+    if not Path(path).expanduser().resolve().is_relative_to(inside):
+        raise StateError(f"state_file {path} is outside of the folder for state files, {inside}")
 
 
 def path_for(path: str, camera: str, shared: bool) -> str:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -323,7 +324,8 @@ class StreamSession:
         first = self.stream is None and not self._failed
         reason = None if first else self._reason(frame, asked)
         for stage in self.stages:
-            found = stage.before_frame(frame)
+            with _forgotten_if_it_fails(stage):
+                found = stage.before_frame(frame)
             reason = reason or (None if first else found)
         if self.stream is None or reason:
             self.stream = self._start(frame, reason)
@@ -348,7 +350,8 @@ class StreamSession:
         valid = found.valid if frame.visible is None else found.valid & frame.visible
         found = replace(found, mask=valid, known_camera=frame.camera_matrix)
         for stage in self.stages:
-            found = stage.after_prediction(frame, found)
+            with _forgotten_if_it_fails(stage):
+                found = stage.after_prediction(frame, found)
         assert self.stream is not None
         self._keeper.remember(self._settings, self.stream)
         return found
@@ -406,6 +409,16 @@ class StreamSession:
         for stage in self.stages:
             stage.started(reason)
         return stream
+
+
+@contextmanager
+def _forgotten_if_it_fails(stage: StreamStage) -> Iterator[None]:
+    """What a stage cannot work with, such as a damaged state, must not fail every frame."""
+    try:
+        yield
+    except Exception:
+        stage.restore(None)
+        raise
 
 
 def _as_it_is(frame: Frame) -> Frame:

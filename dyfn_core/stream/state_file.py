@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
@@ -26,10 +30,11 @@ from dyfn_core.metric.references import Evidence
 from dyfn_core.metric.scale_filter import FilterState
 from dyfn_core.prediction import StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, StreamMemory
-from dyfn_core.stream.plain_values import PlainError, from_plain, to_plain
+from dyfn_core.stream.plain_values import from_plain, to_plain
 from dyfn_core.stream.scene_cut import CutState, PictureFeatures
 
 FORMAT = "dyfn-stream 1"
+LARGEST = 1 << 28  # bytes; the state of the largest model and picture has a tenth of it
 
 
 class StateFileError(ValueError):
@@ -129,14 +134,11 @@ def load_stream(path: str | Path, fingerprint: str) -> SavedStream:
     another model's.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise StateFileError(f"cannot read {path}: {error.strerror or error}") from error
+    data = _read(path)
     try:
         metadata = _metadata(data)
         tensors = load_tensors(data)
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, RecursionError) as error:
         raise StateFileError(f"{path} is damaged, or no state file: {error}") from error
     if metadata.get("format") != FORMAT:
         raise StateFileError(
@@ -148,7 +150,7 @@ def load_stream(path: str | Path, fingerprint: str) -> SavedStream:
     try:
         described = json.loads(content)
         model, state = described["model"], from_plain(described["state"], tensors, _KINDS)
-    except (json.JSONDecodeError, KeyError, TypeError, PlainError) as error:
+    except Exception as error:  # whatever a stranger's description may raise
         raise StateFileError(f"{path}: the description of the state is bad: {error}") from error
     if model != fingerprint:
         raise StateFileError(
@@ -156,7 +158,55 @@ def load_stream(path: str | Path, fingerprint: str) -> SavedStream:
         )
     if not isinstance(state, SavedStream):
         raise StateFileError(f"{path} holds a {type(state).__name__}, expected a SavedStream")
+    try:
+        _check_numbers(state.memory)
+    except Exception as error:
+        raise StateFileError(f"{path} holds an unusable state: {error}") from error
     return state
+
+
+def _read(path: Path) -> bytes:
+    """All of a regular file of at most LARGEST bytes. Raises StateFileError."""
+    try:
+        # A pipe that nobody writes to would otherwise block for ever.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        with os.fdopen(handle, "rb") as file:
+            found = os.fstat(handle)
+            if not stat.S_ISREG(found.st_mode):
+                raise StateFileError(f"{path} is no regular file")
+            if found.st_size > LARGEST:
+                raise StateFileError(
+                    f"{path} has {found.st_size} bytes, a state has at most {LARGEST}"
+                )
+            return file.read(LARGEST)
+    except OSError as error:
+        raise StateFileError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def check_replaceable(path: Path) -> None:
+    """Raises StateFileError when there is something that is no state file of ours."""
+    if not os.path.lexists(path):
+        return
+    if path.is_symlink() or not path.is_file():
+        raise StateFileError(f"{path} is no regular file, it is not replaced")
+    try:
+        ours = _metadata(_read(path)).get("format", "").startswith(FORMAT.split()[0])
+    except (ValueError, KeyError, AttributeError, RecursionError):
+        ours = False
+    if not ours:
+        raise StateFileError(f"{path} is no state file, it is not replaced")
+
+
+def _check_numbers(memory: StreamMemory) -> None:
+    """A memory of NaN would give NaN for ever."""
+    hidden = None if memory.state is None else memory.state.hidden
+    if hidden is not None and not torch.isfinite(hidden).all():
+        raise ValueError("DyFN's hidden state is not finite")
+    for name, mean in (("focal", memory.focal), ("shift", memory.shift)):
+        if mean is not None and not (math.isfinite(mean.value) and math.isfinite(mean.spread)):
+            raise ValueError(f"the {name} is not finite")
+    if memory.unit is not None and not (math.isfinite(memory.unit) and memory.unit > 0):
+        raise ValueError(f"the unit is {memory.unit}")
 
 
 def restore(stream: DepthStream, saved: SavedStream) -> None:

@@ -43,7 +43,8 @@ def decode_camera_info(
     """sensor_msgs/CameraInfo -> the intrinsics of an image of height x width pixels.
 
     rectified: take P, which describes rectified images, instead of K.
-    Raises MessageError: uncalibrated (K[0] == 0), no pinhole matrix, another size than the image.
+    Raises MessageError: uncalibrated (K[0] == 0), no pinhole matrix, one of no real camera, D that
+    is not finite, another size than the image.
     """
     k = _field(info, "k")
     matrix = np.array(k, np.float64).reshape(3, 3)
@@ -65,8 +66,24 @@ def decode_camera_info(
     matrix[1, 2] = (matrix[1, 2] - y + 0.5) / bin_y - 0.5
     matrix[0, :2] /= bin_x
     matrix[1, 1] /= bin_y
+    _check_plausible(matrix, height, width)
     d = () if rectified else tuple(float(value) for value in _field(info, "d"))
+    if not np.isfinite(d).all():
+        raise MessageError(f"D has values that are no finite numbers: {list(d)}")
     return CameraCalibration(matrix, lens_model(str(info.distortion_model)), d)
+
+
+def _check_plausible(matrix: np.ndarray, height: int, width: int) -> None:
+    """The bounds leave room for every lens, and for crops far off the centre."""
+    size = max(height, width)
+    focals, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2] / (width, height)
+    if not ((focals > 0.01 * size) & (focals < 1000 * size)).all():
+        raise MessageError(
+            f"focal lengths {focals.tolist()} of no real camera of {width} x {height} pixels, "
+            f"expected {0.01 * size:g} to {1000 * size:g}"
+        )
+    if not (abs(centre - 0.5) < 100).all():
+        raise MessageError(f"a principal point {matrix[:2, 2].tolist()} of no real camera")
 
 
 # Other names of models that ROS knows; compared in lower case, words joined by _.

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dyfn_ros.messages.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
-from dyfn_ros.messages.picture_size import JPEG, PNG, check_picture_size
+from dyfn_ros.messages.picture_size import JPEG, MAX_PIXELS, PNG, check_picture_size
 
 _LAYOUT = re.compile(
     r"^\s*(?:(?P<encoding>\w+)\s*;\s*)?(?P<codec>\w+)(?:\s+compressed\s*(?P<order>\w*))?"
@@ -40,18 +40,18 @@ def parse_format(text: str) -> Layout:
     )
 
 
-def decode_compressed(message: Any) -> np.ndarray:
+def decode_compressed(message: Any, most: int = MAX_PIXELS) -> np.ndarray:
     """sensor_msgs/CompressedImage with JPEG or PNG -> H x W x 3 uint8 RGB.
 
     What the data is decides on the codec. `format` decides on what a file cannot say: whether a
     grey one is a Bayer mosaic, and whether the codec was given RGB where files have BGR.
     Raises MessageError for other codecs, depth transports, incomplete or broken files, and more
-    than MAX_PIXELS.
+    pixels than `most`.
     """
     data, text = np.frombuffer(message.data, np.uint8), str(message.format)
     content = data.tobytes()
     _check_complete(content, text)
-    check_picture_size(content)
+    check_picture_size(content, most)
     layout = parse_format(text)
     mosaic = layout.encoding.startswith("bayer_") and layout.order in ("", layout.encoding)
     try:

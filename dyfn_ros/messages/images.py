@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dyfn_ros.messages.encodings import MessageError, Raster, decode_colour, decode_metric_depth
+from dyfn_ros.messages.picture_size import MAX_PIXELS, check_pixels
 
 __all__ = [
     "MessageError",
@@ -40,8 +41,12 @@ def _bytes(data: Any) -> np.ndarray:
     return np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
 
 
-def decode_image(message: Any) -> np.ndarray:
-    """sensor_msgs/Image -> H x W x 3 uint8 RGB. Raises MessageError (see decode_colour)."""
+def decode_image(message: Any, most: int = MAX_PIXELS) -> np.ndarray:
+    """sensor_msgs/Image -> H x W x 3 uint8 RGB.
+
+    Raises MessageError (see decode_colour), also for more pixels than `most`.
+    """
+    check_pixels(int(message.width), int(message.height), most)
     return decode_colour(_raster(message))
 
 

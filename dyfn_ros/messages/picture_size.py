@@ -18,20 +18,24 @@ _NOT_FRAMES = (0xC4, 0xC8, 0xCC)  # C0 to CF are starts of frames, but for these
 _ALONE = (0x01, *range(0xD0, 0xD9))  # markers without a length
 
 
-def check_picture_size(data: bytes) -> None:
-    """data: of a JPEG or PNG file. Raises MessageError when its header says more than MAX_PIXELS,
-    or no size at all."""
+def check_pixels(width: int, height: int, most: int = MAX_PIXELS) -> None:
+    """Raises MessageError for a picture of more than so many pixels."""
+    if width * height > most:
+        raise MessageError(
+            f"the picture says that it is {width} x {height} pixels; at most {most} "
+            f"({most / (1 << 20):.4g} megapixels) are decoded"
+        )
+
+
+def check_picture_size(data: bytes, most: int = MAX_PIXELS) -> None:
+    """data: of a JPEG or PNG file. Raises MessageError when its header says more pixels than
+    `most`, or no size at all."""
     size = _png_size(data) if data.startswith(PNG) else _jpeg_size(data)
     if size is None:
         raise MessageError(
             f"the picture of {len(data)} bytes cannot be decoded: no header says its size"
         )
-    width, height = size
-    if width * height > MAX_PIXELS:
-        raise MessageError(
-            f"the picture says that it is {width} x {height} pixels; at most {MAX_PIXELS} "
-            f"({MAX_PIXELS >> 20} megapixels) are decoded"
-        )
+    check_pixels(*size, most)
 
 
 def _png_size(data: bytes) -> tuple[int, int] | None:

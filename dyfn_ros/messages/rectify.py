@@ -12,6 +12,8 @@ import numpy as np
 from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.images import MessageError
 
+_LEAST_VISIBLE = 0.1  # share of an undistorted image's pixels
+
 
 class LensError(MessageError):
     """A lens model that cannot be undone."""
@@ -80,7 +82,14 @@ class Rectifier:
             raise MessageError(
                 "the lens is distorted (D is not 0) and parameter distortion is refuse"
             )
-        return self._undistorted(image, calibration)
+        flat = self._undistorted(image, calibration)
+        if flat.visible is not None and flat.visible.mean() < _LEAST_VISIBLE:
+            self._warn(
+                f"D {list(calibration.d)} of no real lens: {flat.visible.mean():.1%} of the "
+                "undistorted image would show something; going on without intrinsics"
+            )
+            return PinholeImage(image)
+        return flat
 
     def _undistorted(self, image: np.ndarray, calibration: CameraCalibration) -> PinholeImage:
         key = (*calibration.matrix.reshape(-1), calibration.model, *calibration.d, *image.shape)

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.depth_stream import DepthStream
-from dyfn_core.stream.saving import StateError, path_for
+from dyfn_core.stream.saving import StateError, check_folder, path_for
 from dyfn_core.stream.session import ResetRequest, StreamSession
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.images import MessageError, decode_image
@@ -58,7 +58,7 @@ class Camera:
     name: "" for a camera without a name of its own. settings: the values in force, asked for
     each frame. transforms: of all cameras. submit: takes a Job, -> whether it was accepted.
     release: a CameraInfo has come. warn: for what costs a frame its use. told_reset: takes each
-    reset's line.
+    reset's line. state_folder: where state files may be, unless the settings say.
     """
 
     def __init__(
@@ -73,6 +73,7 @@ class Camera:
         warn: Say,
         error: Say,
         told_reset: Say,
+        state_folder: str = "",
     ) -> None:
         self.name = name
         self.title = f"{node.get_name()}: {name}" if name else node.get_name()
@@ -88,6 +89,7 @@ class Camera:
         self._faults: list[str] = []
         self._came: RecentJobs[FrameJob] = RecentJobs()  # with drop_frames: what may be dropped
         self._placed: Frame | None = None  # the begun frame, if its pose was wanted at once
+        self._state_folder = settings().state_folder or state_folder
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
         self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings(), transforms)
@@ -199,7 +201,9 @@ class Camera:
 
     def _state_file(self) -> str:
         settings = self.settings
-        return path_for(settings.state_file, self.name, len(settings.cameras) > 1)
+        path = path_for(settings.state_file, self.name, len(settings.cameras) > 1)
+        check_folder(path, self._state_folder)
+        return path
 
     # Inference thread.
 
@@ -218,7 +222,9 @@ class Camera:
         """
         settings = self.settings
         compressed = settings.image_transport == "compressed"
-        image = decode_compressed(job.message) if compressed else decode_image(job.message)
+        most = round(settings.max_megapixels * (1 << 20))
+        decode = decode_compressed if compressed else decode_image
+        image = decode(job.message, most)
         header = job.message.header
         view = self._calibrator.view(
             image,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,6 +22,7 @@ from dyfn_core.stream.resets import RESET_SERVICE, TIME_JUMP
 from dyfn_core.stream.saving import StateError
 from dyfn_ros.node.camera import Camera, FrameJob
 from dyfn_ros.node.diagnostics import Report, node_diagnostics
+from dyfn_ros.node.file_work import FileWork
 from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.odometry import TransformTopics
@@ -69,6 +71,9 @@ class StreamDepthNode(LifecycleNode):
         self._cameras: list[Camera] = []
         self._made: list[Callable[[], Any]] = []  # what cleanup undoes
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
+        given = self.settings.state_file  # what is set later must not choose the folder
+        self._state_folder = str(Path(given).expanduser().parent) if given else ""
+        self._files = FileWork()
         self._ports = NodeTopics(self, self._warn)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
@@ -218,6 +223,7 @@ class StreamDepthNode(LifecycleNode):
             warn=self._warn,
             error=self._error,
             told_reset=self._tell_reset,
+            state_folder=self._state_folder,
         )
 
     def _make_services(self) -> None:
@@ -232,7 +238,10 @@ class StreamDepthNode(LifecycleNode):
         }
         for prefix, indices in prefixes.items():
             for name, answer in answers.items():
-                service = self.create_service(Trigger, f"{prefix}/{name}", partial(answer, indices))
+                group = MutuallyExclusiveCallbackGroup()  # who waits for a disk keeps nobody
+                service = self.create_service(
+                    Trigger, f"{prefix}/{name}", partial(answer, indices), callback_group=group
+                )
                 self._made.append(partial(self.destroy_service, service))
         self._made.append(self._watch_clock().unregister)
         for name in self._ports.unused_overrides():
@@ -271,7 +280,7 @@ class StreamDepthNode(LifecycleNode):
             self.get_logger().info(line)
         return response
 
-    def _on_state(
+    async def _on_state(
         self, what: str, indices: list[int], _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """save_state or load_state of each camera; success when all of them worked."""
@@ -279,7 +288,7 @@ class StreamDepthNode(LifecycleNode):
         for camera in (self._cameras[index] for index in indices):
             title = f"{camera.name}: " if camera.name else ""
             try:
-                lines.append(title + getattr(camera, what)())
+                lines.append(title + await self._files.run(getattr(camera, what), self.executor))
             except StateError as error:
                 response.success = False
                 lines.append(f"{title}{error}")

@@ -85,6 +85,14 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         per_camera=True,
         choices=("auto", "best_effort", "reliable"),
     )
+    max_megapixels: float = _parameter(
+        _INPUT,
+        12.5,
+        "Larger images are refused, before they are decoded; 1 is 1024 x 1024 pixels.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.001, 64.0),
+    )
     drop_frames: bool = _parameter(
         _INPUT,
         True,
@@ -125,6 +133,14 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         "Ignore a CameraInfo whose frame_id differs from the image's.",
         changes=RUN,
         per_camera=True,
+    )
+
+    state_folder: str = _parameter(
+        _NODE,
+        "",
+        "Folder that state_file must be in, links followed, whoever sets it; empty: the folder of "
+        "the state_file given at start.",
+        changes=START,
     )
 
     publish_depth: bool = _parameter(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dyfn_core.models import checkpoints
 from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.efficientnet import BATCH_NORM_EPS, EfficientNetLite0, imagenet_weights
@@ -173,3 +175,28 @@ def test_bundled_versions_load_by_name() -> None:
         assert torch.isfinite(depth).any()
         assert not any(torch.equal(depth, other) for other in depths)
         depths.append(depth)
+
+
+def test_every_bundled_file_is_checked_when_it_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert set(checkpoints.BUNDLED.values()) == set(checkpoints.BUNDLED_SHA256)
+    folder = tmp_path / "weights"
+    folder.mkdir()
+    whole = (files("dyfn_core") / "weights" / checkpoints.BUNDLED["dyfn-mini-7"]).read_bytes()
+    flipped = bytearray(whole)
+    flipped[-1] ^= 1
+    (folder / checkpoints.BUNDLED["dyfn-mini-7"]).write_bytes(flipped)
+    monkeypatch.setattr(checkpoints, "files", lambda _: tmp_path)
+    with pytest.raises(checkpoints.CheckpointError, match="damaged: its SHA-256"):
+        load_model("dyfn-mini-7")
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    model = load_model("dyfn-mini-7")
+    name, value = next(iter(model.named_parameters()))
+    with torch.no_grad():
+        value.view(-1)[3] = torch.inf
+    save_model(model, tmp_path / "m.safetensors")
+    with pytest.raises(checkpoints.CheckpointError, match=f"not finite: {name}"):
+        load_model(tmp_path / "m.safetensors")

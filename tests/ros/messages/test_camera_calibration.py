@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -129,3 +130,35 @@ def test_the_frame_id_may_be_left_unchecked() -> None:
     got, _ = view(info(frame_id="other"), check_frame_id=False)
     assert np.array_equal(got.matrix, K)
     assert view(info(frame_id=""))[0].matrix is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"d": [float("nan"), 0.0, 0.0, 0.0, 0.0]}, "no finite numbers"),
+        ({"d": [float("inf"), 0.0, 0.0, 0.0, 0.0]}, "no finite numbers"),
+        ({"d": [1e6, 0.0, 0.0, 0.0, 0.0]}, "of no real lens"),
+        ({"focal": 1e30}, "of no real camera"),
+        ({"focal": 1e-30}, "of no real camera"),
+        ({"centre": 1e9}, "of no real camera"),
+    ],
+)
+def test_nonsense_costs_the_intrinsics_and_is_said(change: dict[str, Any], reason: str) -> None:
+    focal, centre = change.get("focal", 40.0), change.get("centre", 24.0)
+    nonsense = SimpleNamespace(
+        header=SimpleNamespace(frame_id="optical"),
+        width=48,
+        height=36,
+        k=[focal, 0.0, centre, 0.0, focal, 18.0, 0.0, 0.0, 1.0],
+        d=change.get("d", [0.0] * 5),
+        distortion_model="plumb_bob",
+        binning_x=0,
+        binning_y=0,
+        roi=SimpleNamespace(width=0, height=0, x_offset=0, y_offset=0),
+    )
+    said: list[str] = []
+    image = np.full((36, 48, 3), 9, np.uint8)
+    found = Rectifier(said.append).view(image, "optical", nonsense, RectifyRules())
+    assert found.matrix is None and found.visible is None
+    np.testing.assert_array_equal(found.image, image)
+    assert len(said) == 1 and reason in said[0]

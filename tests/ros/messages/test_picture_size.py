@@ -12,6 +12,7 @@ import pytest
 from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.images import decode_image
 from dyfn_ros.messages.picture_size import MAX_PIXELS, PNG, check_picture_size
 from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, compressed_message
@@ -107,3 +108,15 @@ def test_a_replay_goes_on_and_names_topic_and_size(tmp_path: Path) -> None:
 
 def image_bytes(image: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def test_the_limit_is_the_callers_for_raw_images_and_files() -> None:
+    image = np.full((24, 32, 3), 90, np.uint8)
+    raw = SimpleNamespace(
+        data=image.tobytes(), height=24, width=32, encoding="rgb8", step=96, is_bigendian=0
+    )
+    packed = SimpleNamespace(data=image_bytes(image), format="jpeg")
+    for decode, message in ((decode_image, raw), (decode_compressed, packed)):
+        assert decode(message, 24 * 32).shape == (24, 32, 3)
+        with pytest.raises(MessageError, match="32 x 24 pixels; at most 767"):
+            decode(message, 24 * 32 - 1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,15 +17,18 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
 
-from tests.support.probe import Probe
-from tests.support.ros_graph import NodeProcess, own_domain, tiny_node
+from tests.support.probe import Probe, stamped
+from tests.support.ros_graph import NodeProcess, frames, image_message, own_domain, tiny_node
 
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[NodeProcess, Probe]]:
     with own_domain() as environment:
-        node = tiny_node(environment, tmp_path_factory.mktemp("node"))
+        folder = tmp_path_factory.mktemp("node")
+        node = tiny_node(environment, folder, state_file=str(folder / "state.safetensors"))
         probe = Probe(environment)
         yield node, probe
         code = node.end()
@@ -110,4 +115,46 @@ def test_questions_about_what_is_not_there_are_answered(
         (ListParameters, "list_parameters", ListParameters.Request(depth=2**64 - 1)),
     ]:
         assert probe.call(kind, name, request) is not None
+    assert probe.state() == "active"
+
+
+def test_limits_are_refused_at_once(running: tuple[NodeProcess, Probe]) -> None:
+    node, probe = running
+    assert not probe.set("num_tokens", 100_000).successful
+    assert probe.set("max_megapixels", 0.05).successful
+    publisher = probe.node.create_publisher(Image, "/image", 10)
+    probe.wait(lambda: publisher.get_subscription_count() == 1)
+    publisher.publish(stamped(image_message(frames(1, 300, 300)[0]), 1))
+    node.wait_log(r"WARN\].*/image: the picture says that it is 300 x 300 pixels; at most 52429 ")
+    publisher.publish(stamped(image_message(frames(1)[0]), 2))
+    saved = save(probe)
+    probe.wait(lambda: saved("save_state").success)
+
+
+def save(probe: Probe) -> Callable[[str], Trigger.Response]:
+    return lambda name: probe.call(Trigger, name, Trigger.Request())
+
+
+def test_state_files_that_are_none_are_refused_and_nothing_is_overwritten(
+    running: tuple[NodeProcess, Probe], tmp_path: Path
+) -> None:
+    node, probe = running
+    folder = node.log_path.parent
+    text, pipe = folder / "text", folder / "pipe"
+    text.write_text("of somebody else")
+    os.mkfifo(pipe)
+    for path, action, reason in (
+        (text, "save_state", "is no state file, it is not replaced"),
+        (text, "load_state", "no state file"),
+        (pipe, "save_state", "no regular file"),
+        (pipe, "load_state", "no regular file"),
+        (tmp_path / "elsewhere", "save_state", "outside of the folder for state files"),
+        (folder / ".." / "up", "load_state", "outside of the folder for state files"),
+        (Path("/dev/full"), "save_state", "outside of the folder for state files"),
+    ):
+        assert probe.set("state_file", str(path)).successful
+        answer = save(probe)(action)
+        assert not answer.success
+        assert reason in answer.message
+    assert text.read_text() == "of somebody else"
     assert probe.state() == "active"
