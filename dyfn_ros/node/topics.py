@@ -83,8 +83,13 @@ class NodeTopics:
         told how many messages more were sent and did not come, if the middleware knows."""
         name = self._node.resolve_topic_name(topic)
         given = self._given(name, "subscription", [QoSPolicyKind.RELIABILITY])
-        subscribe = partial(self._subscribe, kind, topic, callback, lost)
-        followed = FollowedTopic(self._node, name, qos, subscribe, follow=follow and not given)
+
+        def subscribe(take: Callable[[Any, Any], None], qos: QoSProfile) -> Any:
+            return self._subscribe(kind, topic, take, lost, qos)
+
+        followed = FollowedTopic(
+            self._node, name, qos, subscribe, callback, follow=follow and not given
+        )
         self._followed.append(followed)
         return followed
 
@@ -104,7 +109,7 @@ class NodeTopics:
         self,
         kind: type,
         topic: str,
-        callback: Callable[[Any], None],
+        callback: Callable[..., None],
         lost: Callable[[int], None] | None,
         qos: QoSProfile,
     ) -> Any:

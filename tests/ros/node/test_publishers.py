@@ -127,6 +127,25 @@ def test_reliability_follows_the_publishers_as_they_come_and_go(start: Start) ->
     assert "incompatible" not in node.log
 
 
+def test_no_frame_is_lost_or_comes_twice_while_the_reliability_changes(start: Start) -> None:
+    _, probe = start(drop_frames=False)
+    other = probe.node.create_publisher(Image, "/image", BEST_EFFORT)
+    publisher = probe.node.create_publisher(Image, "/image", PLAIN)
+    known(probe, publisher)
+    probe.wait(lambda: camera(probe)[1]["reliability"] == "best effort")
+    probe.node.destroy_publisher(other)
+    count, reliable = 0, False
+    while not reliable or count % 20:  # until well after the change
+        count += 1
+        publisher.publish(stamped(image_message(frames(1)[0]), count * 10**8))
+        probe.spin_until(lambda: False, 0.05)
+        reliable = camera(probe)[1]["reliability"] == "reliable"
+    depths = probe.received["depth/image"]
+    probe.wait(lambda: len(depths) >= count)
+    assert sorted(map(stamp_of, depths)) == [(n + 1) * 10**8 for n in range(count)]
+    assert camera(probe)[1]["received"] == str(count)
+
+
 def test_images_that_are_lost_on_the_way_are_a_warning_with_advice(start: Start) -> None:
     """A node that stands still loses best-effort images, more than the transport's buffers hold."""
     node, probe = start()
