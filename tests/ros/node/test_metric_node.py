@@ -180,7 +180,7 @@ def test_odometry_without_the_camera_s_place_is_said_and_depth_goes_on(bench: Be
 
 
 def test_fixed_scale_multiplies_depth_and_a_scene_cut_resets_the_stream(bench: Bench) -> None:
-    client = bench.start(metric_source="fixed", metric_scale=1.0, scene_cut_threshold=0.5)
+    client = bench.start(metric_source="fixed", metric_scale=1.0, scene_cut_threshold=0.3)
     one, other = (picture for picture in frames(2, 72, 96, seed=1))
     client.result(client.send(one))
     client.reset()
