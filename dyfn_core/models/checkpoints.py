@@ -51,6 +51,7 @@ BUNDLED = {
 BUNDLED_SHA256 = {
     "dyfn-mini-6.safetensors": "c42f9390e858be7998bf96bae6f76ed1eedde96a0fd2326055346a0c7fbf4294",
     "dyfn-mini-7.safetensors": "43d8c84c699ce9bd794b78c60f2fb079f399e87457fa939b8825f0d8caafa9c1",
+    "dyfn-mini-8.safetensors": "4ac799e188ca029b6c319573c200cccc733dbba6e89ceb299d64ffdbd01b7abe",
     "dyfn-mini.safetensors": "69db69fa6c46167625f787b94deccf87b492c8b58ed993385304d190a4dec08a",
 }
 HUB_FILES = {
