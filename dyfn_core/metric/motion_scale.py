@@ -21,7 +21,13 @@ from dyfn_core.metric.motion import (
     measure_scale,
     observe,
 )
-from dyfn_core.metric.point_memory import MemoryOptions, PointMemory, recall, remember
+from dyfn_core.metric.point_memory import (
+    MemoryOptions,
+    PointMemory,
+    recall,
+    remember,
+    unhidden,
+)
 from dyfn_core.metric.scale_field import FieldOptions, scale_field
 from dyfn_core.metric.scale_filter import (
     FilterOptions,
@@ -260,7 +266,11 @@ def _remembered(
     size = (frame.depth.shape[0], frame.depth.shape[1])
     memory = remember(state.memory, points, camera, pose, stamp, options.memory)
     if state.contradicted <= options.shape_doubt:
+        seen = len(points.ids)
         points = recall(state.memory, points, camera, pose, stamp, size, options.memory)
+        if state.scale is not None:
+            residuals = log_ratios(points, frame.depth, frame.valid) - state.scale.log_scale
+            points = unhidden(points, seen, residuals, options.memory)
     return replace(state, memory=memory), points
 
 

@@ -18,13 +18,16 @@ class MemoryOptions:
     Attributes:
         seconds: age at which a point is forgotten; 0 remembers nothing.
         growth: standard deviation of log depth that a point gains per square root of a second,
-            from the drift of the odometry and from what moved or is hidden by now.
+            from the drift of the odometry and from what moved.
+        behind: log depth by which a remembered point may lie behind the predicted surface;
+            beyond it something that came between hides it.
         most_sigma: standard deviation of log depth beyond which a point is not remembered.
         most: points that are remembered; the oldest are forgotten first.
     """
 
     seconds: float = 3.0
     growth: float = 0.11
+    behind: float = 0.7
     most_sigma: float = 0.2
     most: int = 3000
 
@@ -126,3 +129,20 @@ def recall(
         sigma_pixels=np.concatenate([points.sigma_pixels, memory.sigma_pixels[seen]]),
         sigma=np.concatenate([points.sigma, sigma]),
     )
+
+
+def unhidden(
+    points: MotionPoints, seen: int, residuals: np.ndarray, options: MemoryOptions
+) -> MotionPoints:
+    """Without the remembered points that something hides by now.
+
+    Args:
+        points: N, as recall gives them.
+        seen: how many of them, at the start, are of this frame.
+        residuals: N, log(measured / predicted) less the frame's log scale; NaN: unknown.
+        options: see MemoryOptions.
+    """
+    kept = ~(residuals > options.behind)
+    kept[:seen] = True
+    names = ("ids", "pixels", "depth", "sigma_pixels", "sigma")
+    return replace(points, **{name: getattr(points, name)[kept] for name in names})
