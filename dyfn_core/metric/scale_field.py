@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -74,17 +75,26 @@ def scale_field(
     outside = _features(grid / longest, coarse, middle, options)
     single = np.float32  # enough here, and twice as fast
     near = _kernel(outside.astype(single), inside.astype(single), options)
-    values = (near @ weights.astype(single)).reshape(len(y), len(x))
+    values = (near @ weights).reshape(len(y), len(x))
     return _enlarged(values, (height, width), step)
 
 
 def _enlarged(values: np.ndarray, size: tuple[int, int], step: int) -> np.ndarray:
     """Values at pixels step // 2, step // 2 + step, ... at every pixel."""
+    x, y = _places((values.shape[0], values.shape[1]), size, step)
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR))
+
+
+@lru_cache(4)
+def _places(
+    coarse: tuple[int, int], size: tuple[int, int], step: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each pixel is among the coarse values, as cv2.remap's fixed-point maps."""
     height, width = size
     x = (np.arange(width, dtype=np.float32) - step // 2) / step
     y = (np.arange(height, dtype=np.float32) - step // 2) / step
-    x, y = np.meshgrid(x.clip(0, values.shape[1] - 1), y.clip(0, values.shape[0] - 1))
-    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR))
+    x, y = np.meshgrid(x.clip(0, coarse[1] - 1), y.clip(0, coarse[0] - 1))
+    return cv2.convertMaps(x, y, cv2.CV_16SC2)
 
 
 def _log(depth: np.ndarray) -> np.ndarray:
@@ -117,10 +127,12 @@ def _conditioned(
     kernel: np.ndarray, residuals: np.ndarray, noise: np.ndarray, misfit: np.ndarray
 ) -> np.ndarray:
     """The weights of the points (N), by iteratively reweighted least squares (Cauchy's)."""
-    variance = noise**2
+    kernel = kernel.astype(np.float32)
+    residuals, variance = residuals.astype(np.float32), (noise**2).astype(np.float32)
+    start = variance
     for _ in range(_ROUNDS):
         factor = cho_factor(kernel + np.diag(variance), lower=True, check_finite=False)
         weights: np.ndarray = cho_solve(factor, residuals, check_finite=False)
         left = (residuals - kernel @ weights) / (_OUTLIER * misfit)
-        variance = noise**2 * (1 + left**2)
+        variance = (start * (1 + left**2)).astype(np.float32)
     return weights
