@@ -14,6 +14,7 @@ from dyfn_core.data.frames import DataError, DataReport, FrameError, RgbdFrame
 
 LISTED = 8  # entries of a folder that an error names
 EXR_CHANNELS = ("Y", "Z", "V", "R")  # where a one-channel picture may be
+LFS_POINTER = b"version https://git-lfs"  # how its text begins
 SAME_ASPECT = 0.02  # relative difference at which colour and depth are the same view
 
 
@@ -169,12 +170,25 @@ def needed(module: str, path: Path) -> Any:
 
 
 def read_table(path: Path, columns: int) -> np.ndarray:
-    """Lines of numbers -> N x columns float64. Raises FrameError naming file and expectation."""
+    """Lines of numbers -> N x columns float64. Raises FrameError naming file and expectation.
+
+    A matrix of so many numbers may be written in as many lines as it has rows.
+    """
+    expected = f"{path}: expected lines of {columns} numbers"
+    table = numbers(path, expected)
+    if table.shape[1] == columns:
+        return table
+    if table.size == columns:
+        return table.reshape(1, columns)
+    raise FrameError(f"{expected}, got {len(table)} lines of {table.shape[1]}")
+
+
+def numbers(path: Path, expected: str) -> np.ndarray:
+    """Lines of equally many numbers, N x k float64. Raises FrameError, which begins as expected."""
     try:
-        table = np.loadtxt(path, dtype=np.float64, ndmin=2, encoding="utf-8-sig")
-        return table.reshape(-1, columns)
+        return np.loadtxt(path, dtype=np.float64, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise FrameError(f"{path}: expected lines of {columns} numbers: {error}") from error
+        raise FrameError(f"{expected}: {error}") from error
 
 
 def _decoded(path: Path, flags: int) -> np.ndarray:
@@ -184,5 +198,7 @@ def _decoded(path: Path, flags: int) -> np.ndarray:
     except (OSError, cv2.error) as error:
         raise FrameError(f"{path}: cannot be read: {error}") from error
     if pixels is None:
+        if data[: len(LFS_POINTER)].tobytes() == LFS_POINTER:
+            raise FrameError(f"{path} is a Git LFS pointer: `git lfs pull` fetches the image")
         raise FrameError(f"{path}: no such image, or a damaged one")
     return pixels

@@ -118,7 +118,7 @@ class Plausibility:
         if scored is not None and self._frames and scored < self._frames / 2:
             found.append(
                 f"{scored} of {self._frames} frames are scored, less than half: the others have "
-                "no ground truth, or too little of it"
+                "no ground truth or no depth, or too little of them in common"
             )
         if self._medians:
             found += [self._doubted_unit(), self._doubted_pairs()]

@@ -15,7 +15,9 @@ from dyfn_core.geometry.camera import doubted_intrinsics
 Camera = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels, the first pixel's centre 0
 Size = tuple[int, int]  # rows, columns
 SKEW = 1e-3  # relative to fx; more is refused
-EXPECTED = "a 3 x 3 (or 4 x 4) camera matrix [fx 0 cx; 0 fy cy; 0 0 1], or fx fy cx cy, in pixels"
+EXPECTED = (
+    "a 3 x 3 (or 3 x 4, 4 x 4) camera matrix [fx 0 cx; 0 fy cy; 0 0 1], or fx fy cx cy, in pixels"
+)
 # The published calibrations of cameras whose folders come without one, of 640 x 480 pixels.
 TUM_CAMERAS: dict[str, Camera] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
@@ -109,7 +111,7 @@ def read_camera(path: Path) -> FolderCamera:
         values = [float(word) for word in words]
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: expected {EXPECTED}: {error}") from error
-    shapes = {9: (3, 3), 16: (4, 4)}
+    shapes = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
     if len(values) == 4:
         fx, fy, cx, cy = values
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

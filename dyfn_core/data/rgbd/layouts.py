@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.files import numbered_files, read_table, subfolders, usable_poses
+from dyfn_core.data.files import numbered_files, subfolders
 from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import (
     PUBLISHED_SIZE,
@@ -20,7 +20,13 @@ from dyfn_core.data.rgbd.cameras import (
     published_camera,
 )
 from dyfn_core.data.rgbd.folder import Calibration, FrameFiles, RgbdFolder
-from dyfn_core.data.rgbd.lists import associated_files, nearest, stamped_files, trajectory
+from dyfn_core.data.rgbd.lists import (
+    associated_files,
+    nearest,
+    read_poses,
+    stamped_files,
+    trajectory,
+)
 from dyfn_core.data.rgbd.names import FIRST_TIME, frame_numbers, paired, visible_files
 
 LAYOUTS = TUM, ASSOCIATIONS, SEVEN_SCENES, SCANNET, PLAIN = (
@@ -129,7 +135,7 @@ def _plain(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFold
     poses: Poses = {}
     table = folder / "poses.txt"
     if table.exists():
-        rows = usable_poses(read_table(table, 16), table, report).reshape(-1, 4, 4)
+        rows = read_poses(table, report)
         if len(rows) != len(images):
             raise DataError(f"{table}: {len(rows)} poses for {len(images)} images")
         poses = {image: row for image, row in zip(images, rows, strict=True) if _finite(row)}
@@ -276,12 +282,14 @@ def _pose_files(texts: Mapping[Path, Path], report: DataReport) -> dict[Path, np
     poses = {}
     for image, path in texts.items():
         try:
-            pose = read_table(path, 16).reshape(4, 4)
-        except (FrameError, ValueError) as error:
+            found = read_poses(path, DataReport(str(path)))
+        except FrameError as error:
             report.miss(f"pose that cannot be read: {error}", path)
             continue
-        if _finite(pose):
-            poses[image] = pose
+        if len(found) != 1:
+            report.miss(f"pose file with {len(found)} poses", path)
+        elif _finite(found[0]):
+            poses[image] = found[0]
         else:
             report.miss("pose that is not finite (the frame stays)", path)
     return poses

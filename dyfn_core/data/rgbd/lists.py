@@ -9,8 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from dyfn_core.data.files import read_table, usable_poses
-from dyfn_core.data.frames import DataError, DataReport
+from dyfn_core.data.files import numbers, read_table, usable_poses
+from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
 Thing = TypeVar("Thing")
@@ -54,14 +54,44 @@ def associated_files(path: Path, report: DataReport) -> list[tuple[float, Path, 
     return sorted(entries)
 
 
+def read_poses(path: Path, report: DataReport) -> np.ndarray:
+    """Camera to world, N x 4 x 4; NaN where a pose is none, which is counted.
+
+    A line is a pose of 16 numbers (4 x 4), of 12 (3 x 4) or of 8 (`stamp tx ty tz qx qy qz qw`); or
+    lines of 4 numbers are the rows of 4 x 4 or 3 x 4 matrices. Raises FrameError.
+    """
+    expected = f"{path}: expected lines of 16 (4 x 4), 12 (3 x 4) or 8 numbers (stamp t q)"
+    table = numbers(path, expected)
+    lines, columns = table.shape
+    if columns == 4:
+        whole = lines % 4 == 0 and bool((table[3::4] == [0, 0, 0, 1]).all())
+        height = 4 if whole else 3
+        if lines % height == 0:
+            table = table.reshape(-1, height * 4)
+    if table.shape[1] == 8:
+        rows = usable_poses(table, path, report, slice(4, 8))
+        return np.array([_posed(row[1:]) for row in rows]).reshape(-1, 4, 4)
+    if table.shape[1] not in (12, 16):
+        raise FrameError(f"{expected}, got {lines} lines of {columns}")
+    rows = usable_poses(table, path, report)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
+    return poses
+
+
+def _posed(row: np.ndarray) -> np.ndarray:
+    """tx ty tz qx qy qz qw -> 4 x 4; all NaN for a row of NaN."""
+    if not np.isfinite(row).all():
+        return np.full((4, 4), np.nan)
+    tx, ty, tz, qx, qy, qz, qw = row.tolist()
+    return rigid(quaternion_rotation(qw, qx, qy, qz), np.array([tx, ty, tz]))
+
+
 def trajectory(path: Path, report: DataReport) -> list[tuple[float, np.ndarray]]:
     """Lines `stamp tx ty tz qx qy qz qw`: 4 x 4 camera to world, sorted by stamp."""
     rows = usable_poses(read_table(path, 8), path, report, slice(4, 8))
     rows = rows[np.isfinite(rows).all(1)]
-    return [
-        (stamp, rigid(quaternion_rotation(qw, qx, qy, qz), np.array([tx, ty, tz])))
-        for stamp, tx, ty, tz, qx, qy, qz, qw in sorted(rows.tolist())
-    ]
+    return [(row[0], _posed(np.array(row[1:]))) for row in sorted(rows.tolist())]
 
 
 def nearest(entries: list[tuple[float, Thing]], stamp: float, tolerance: float) -> Thing | None:

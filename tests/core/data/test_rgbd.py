@@ -13,6 +13,7 @@ from dyfn_core.data.rgbd.cameras import FolderCamera, published_camera, read_cam
 from dyfn_core.data.rgbd.folder import RgbdFolder
 from dyfn_core.data.rgbd.layouts import FolderOptions, find_folders, layout_of, open_folder
 from dyfn_core.data.rgbd.names import frame_numbers, in_numeric_order, paired
+from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 from tests.support.rgbd_folders import (
     MATRIX,
     SIZE,
@@ -330,3 +331,66 @@ def test_depth_of_a_folder_with_its_own_camera_stays_where_it_is(tmp_path: Path)
     np.testing.assert_allclose(depth, stored / 1000, atol=1e-6)
     given, _ = opened(tmp_path, FolderOptions(intrinsics=(510, 510, 320, 240)))
     np.testing.assert_allclose(given.depth(given.frames[0]), stored / 1000, atol=1e-6)
+
+
+POSES = [
+    rigid(quaternion_rotation(0.9, 0.1, -0.3, 0.2), np.array([i, 2.0, -1.0])) for i in (0, 1, 2)
+]
+TUM_ROWS = [[50 + i, i, 2.0, -1.0, 0.1, -0.3, 0.2, 0.9] for i in (0, 1, 2)]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [pose.ravel() for pose in POSES],
+        [pose[:3].ravel() for pose in POSES],  # KITTI
+        np.concatenate(POSES),
+        np.concatenate([pose[:3] for pose in POSES]),
+        TUM_ROWS,
+    ],
+    ids=["4 x 4", "3 x 4", "lines of 4 x 4", "lines of 3 x 4", "TUM"],
+)
+def test_poses_are_read_in_every_common_form(rows: list[np.ndarray], tmp_path: Path) -> None:
+    write_folder(tmp_path, [f"{i}.png" for i in range(3)], [f"{i}.png" for i in range(3)])
+    np.savetxt(tmp_path / "poses.txt", rows)
+    folder, report = opened(tmp_path)
+    assert not report.problems
+    np.testing.assert_allclose([frame.pose for frame in folder.frames], POSES, atol=1e-9)
+
+
+@pytest.mark.parametrize("columns", [7, 6, 2])
+def test_poses_of_another_form_are_refused(columns: int, tmp_path: Path) -> None:
+    """24 lines of 2 numbers would be 3 poses by their count alone."""
+    write_folder(tmp_path, [f"{i}.png" for i in range(3)], [f"{i}.png" for i in range(3)])
+    np.savetxt(tmp_path / "poses.txt", np.ones((24, columns)))
+    with pytest.raises(DataError, match=rf"poses.txt: expected .* got 24 lines of {columns}"):
+        opened(tmp_path)
+
+
+def test_a_row_that_is_no_pose_leaves_the_frame_without_one(tmp_path: Path) -> None:
+    write_folder(tmp_path, [f"{i}.png" for i in range(3)], [f"{i}.png" for i in range(3)])
+    rows = np.array(TUM_ROWS)
+    rows[1, 4:] = 0
+    np.savetxt(tmp_path / "poses.txt", rows)
+    folder, report = opened(tmp_path)
+    assert [frame.pose is None for frame in folder.frames] == [False, True, False]
+    assert report.problems == {
+        "pose that is none (the frame stays)": [f"{tmp_path / 'poses.txt'} row 1"]
+    }
+
+
+def test_a_projection_matrix_is_a_camera(tmp_path: Path) -> None:
+    """P of a CameraInfo; its fourth column is the place of a second camera."""
+    projection = np.column_stack([MATRIX, [-0.12, 0, 0]])
+    np.savetxt(tmp_path / "K.txt", projection)
+    found = read_camera(tmp_path / "K.txt").pixels
+    assert found == pytest.approx([MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2]])
+
+
+def test_a_picture_that_git_lfs_did_not_fetch_is_told_so(tmp_path: Path) -> None:
+    write_folder(tmp_path, ["0.png"], ["0.png"])
+    pointer = "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 7\n"
+    (tmp_path / "depth" / "0.png").write_text(pointer)
+    folder, _ = opened(tmp_path)
+    with pytest.raises(FrameError, match="Git LFS pointer: `git lfs pull`"):
+        folder.depth(folder.frames[0])

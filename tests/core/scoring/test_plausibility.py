@@ -127,8 +127,8 @@ def test_fewer_than_half_of_the_frames_scored_is_said(scored: int, said: bool) -
     texts = told(lambda i, p: (p[0], p[1] if i < scored else None), scored=scored)
     assert texts == (
         [
-            f"{scored} of 12 frames are scored, less than half: the others have no ground truth, "
-            "or too little of it"
+            f"{scored} of 12 frames are scored, less than half: the others have no ground truth "
+            "or no depth, or too little of them in common"
         ]
         if said
         else []
