@@ -30,7 +30,7 @@ class TrackOptions:
     long_side: int = 320
     most: int = 700
     spacing: float = 5.0
-    forward_backward: float = 1.0
+    forward_backward: float = 0.7
 
 
 @dataclass(frozen=True)
@@ -122,14 +122,18 @@ def _followed(
     before = ((state.tracks.points + 0.5) / scale - 0.5).astype(np.float32)
     guess = before if rotation is None else _turned(state.tracks.points, rotation, scale)
     after, found = _flow(state.grey, grey, before, guess)
-    back, returned = _flow(grey, state.grey, after, before)
+    back, returned = _flow(grey, state.grey, after, before, levels=1)  # the guess is near
     good = found & returned & _inside(after, grey, _BORDER)
     good &= np.linalg.norm(back - before, axis=1) < options.forward_backward
     return state.tracks.ids[good], after[good]
 
 
 def _flow(
-    first: np.ndarray, second: np.ndarray, points: np.ndarray, guess: np.ndarray
+    first: np.ndarray,
+    second: np.ndarray,
+    points: np.ndarray,
+    guess: np.ndarray,
+    levels: int = _LEVELS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places in the second picture (N x 2) of points of the first one, and which were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
@@ -138,7 +142,7 @@ def _flow(
         points,
         guess.copy(),  # it is written to
         winSize=_WINDOW,
-        maxLevel=_LEVELS,
+        maxLevel=levels,
         criteria=_CRITERIA,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
