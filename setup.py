@@ -9,8 +9,8 @@ SHARE = f"share/{PACKAGE}"
 
 
 def files(folder: str) -> list[str]:
-    """The files of a folder beside this script, as setuptools wants them named."""
-    return sorted(str(path) for path in Path(folder).iterdir() if path.is_file())
+    """The files of a folder beside this script, none where it is not; as setuptools wants them."""
+    return sorted(str(path) for path in Path(folder).glob("*") if path.is_file())
 
 
 setup(

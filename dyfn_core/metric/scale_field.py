@@ -75,7 +75,8 @@ def scale_field(
     outside = _features(grid / longest, coarse, middle, options)
     single = np.float32  # enough here, and twice as fast
     near = _kernel(outside.astype(single), inside.astype(single), options)
-    values = (near @ weights).reshape(len(y), len(x))
+    # Rounding hides the last bits, which the number of threads of the solution decides.
+    values = (near @ weights.astype(single)).reshape(len(y), len(x))
     return _enlarged(values, (height, width), step)
 
 
@@ -127,12 +128,10 @@ def _conditioned(
     kernel: np.ndarray, residuals: np.ndarray, noise: np.ndarray, misfit: np.ndarray
 ) -> np.ndarray:
     """The weights of the points (N), by iteratively reweighted least squares (Cauchy's)."""
-    kernel = kernel.astype(np.float32)
-    residuals, variance = residuals.astype(np.float32), (noise**2).astype(np.float32)
-    start = variance
+    variance = noise**2
     for _ in range(_ROUNDS):
         factor = cho_factor(kernel + np.diag(variance), lower=True, check_finite=False)
         weights: np.ndarray = cho_solve(factor, residuals, check_finite=False)
         left = (residuals - kernel @ weights) / (_OUTLIER * misfit)
-        variance = (start * (1 + left**2)).astype(np.float32)
+        variance = noise**2 * (1 + left**2)
     return weights

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -105,3 +109,30 @@ def test_points_of_what_moves_are_held_back_where_noise_is_shared() -> None:
     robust = scale_field(where, values, 1.5 * sigma, shape, OPTIONS, sigma)
     assert wrong.sum() > 15
     assert np.median(robust[:60, :80]) == pytest.approx(0.1, abs=0.08)
+
+
+ONE_FIELD = """
+import hashlib, sys
+import numpy as np
+from dyfn_core.metric.scale_field import FieldOptions, scale_field
+draw = np.random.default_rng(0)
+pixels, residuals = draw.uniform(0, [319, 239], (400, 2)), draw.normal(0, 0.1, 400)
+depth = draw.uniform(1, 4, (240, 320)).astype(np.float32)
+field = scale_field(pixels, residuals, draw.uniform(0.1, 0.3, 400), depth, FieldOptions())
+print(hashlib.sha256(field.tobytes()).hexdigest())
+"""
+
+
+def test_the_field_is_the_same_on_any_number_of_threads() -> None:
+    """A node with one thread and a replay with several give the same bytes."""
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", ONE_FIELD],
+            env={**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2", "3")
+    }
+    assert len(found) == 1
