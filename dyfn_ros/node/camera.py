@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -263,8 +262,12 @@ class Camera:
         for dropped in self._came.before(job):
             if time.monotonic() > until:
                 return
-            with suppress(Exception):  # a bad image; it is counted as dropped
+            try:
                 session.skip(self.decode(dropped)[0])
+            except MessageError:
+                pass  # a bad image; it is counted as dropped
+            except Exception as error:
+                self._warn(f"{self.image_topic}: no look at a dropped picture: {error}")
 
     def _place(self, job: FrameJob, frame: Frame) -> Frame:
         until = job.arrived + self.settings.odometry_wait
