@@ -24,6 +24,7 @@ from dyfn_core.metric.motion import (
 from dyfn_core.metric.point_memory import (
     MemoryOptions,
     PointMemory,
+    chosen,
     recall,
     remember,
     unhidden,
@@ -200,8 +201,12 @@ def step(
     )
     elapsed = 0.0 if state.stamp is None else max(frame.stamp - state.stamp, 0.0)
     state = replace(_doubted(state, points, elapsed, options), motion=motion, stamp=frame.stamp)
+    seen = len(points.ids)
     state, points = _remembered(state, points, frame, options)
     ratios = log_ratios(points, frame.depth, frame.valid)
+    if state.scale is not None:
+        kept = unhidden(ratios - state.scale.log_scale, seen, options.memory)
+        points, ratios = chosen(points, kept), ratios[kept]
     measured = measure_scale(points, ratios, frame.depth.shape, options.motion)
     scale = _filtered(state.scale, measured, frame.stamp, options.scale)
     unit = scale.log_scale if state.unit is None and scale is not None else state.unit
@@ -266,11 +271,7 @@ def _remembered(
     size = (frame.depth.shape[0], frame.depth.shape[1])
     memory = remember(state.memory, points, camera, pose, stamp, options.memory)
     if state.contradicted <= options.shape_doubt:
-        seen = len(points.ids)
         points = recall(state.memory, points, camera, pose, stamp, size, options.memory)
-        if state.scale is not None:
-            residuals = log_ratios(points, frame.depth, frame.valid) - state.scale.log_scale
-            points = unhidden(points, seen, residuals, options.memory)
     return replace(state, memory=memory), points
 
 

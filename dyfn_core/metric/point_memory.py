@@ -131,18 +131,23 @@ def recall(
     )
 
 
-def unhidden(
-    points: MotionPoints, seen: int, residuals: np.ndarray, options: MemoryOptions
-) -> MotionPoints:
-    """Without the remembered points that something hides by now.
+def unhidden(residuals: np.ndarray, seen: int, options: MemoryOptions) -> np.ndarray:
+    """Which points are no remembered ones that something hides by now.
 
     Args:
-        points: N, as recall gives them.
-        seen: how many of them, at the start, are of this frame.
         residuals: N, log(measured / predicted) less the frame's log scale; NaN: unknown.
+        seen: how many of them, at the start, are of this frame, as recall orders them.
         options: see MemoryOptions.
+
+    Returns:
+        N bool.
     """
     kept = ~(residuals > options.behind)
     kept[:seen] = True
+    return kept
+
+
+def chosen(points: MotionPoints, kept: np.ndarray) -> MotionPoints:
+    """Those of N points where `kept` (N bool) says so."""
     names = ("ids", "pixels", "depth", "sigma_pixels", "sigma")
     return replace(points, **{name: getattr(points, name)[kept] for name in names})

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 from dyfn_core.metric.pose_history import NoPose
 from dyfn_core.metric.pose_limits import PoseLimits
 from dyfn_ros.messages.odometry import frame_name, stamp_of
-from dyfn_ros.messages.transforms import TransformBuffer, TransformError
+from dyfn_ros.messages.transforms import TransformError
+from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.image_recording import is_image_recording
 from dyfn_ros.recordings.rgbd_folder import is_rgbd_folder
-from dyfn_ros.recordings.storage.base import Storage
 from dyfn_ros.recordings.storage.open import open_storage
+from dyfn_ros.recordings.transform_topics import TransformFeed
 from dyfn_ros.recordings.typestore import ODOMETRY
-
-STATIC = "tf_static"
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def read_odometry(path: Path, frame_id: str) -> tuple[RecordedOdometry | None, s
         messages.append((stamp_of(message.header), bytes(recorded.data)))
         moving = frame_name(message.child_frame_id)
     try:
-        pose = _mounting(storage, moving, frame_name(frame_id))
+        pose = _mounting(path, moving, frame_name(frame_id))
     except TransformError as error:
         return None, f"{path}: {topics[0]} is of {moving!r}, the camera is {frame_id!r}: {error}"
     rotation = Rotation.from_matrix(pose[:3, :3]).as_quat()
@@ -91,15 +90,14 @@ def read_odometry(path: Path, frame_id: str) -> tuple[RecordedOdometry | None, s
     return RecordedOdometry(topics[0], tuple(messages), text), ""
 
 
-def _mounting(storage: Storage, moving: str, camera: str) -> np.ndarray:
+def _mounting(path: Path, moving: str, camera: str) -> np.ndarray:
     """4 x 4, by the transforms that hold for ever."""
     if moving == camera:
         return np.eye(4)
-    transforms = TransformBuffer(PoseLimits())
-    static = [name for name in storage.topics if name.lstrip("/") == STATIC]
-    for recorded in storage.messages(static) if static else ():
-        transforms.take(recorded.message(), static=True)
-    found = transforms.lookup(moving, camera, 0)
+    feed = TransformFeed(path, PoseLimits())
+    for reason in feed.losses:
+        raise RecordingError(reason)
+    found = feed.buffer.lookup(moving, camera, 0)
     if isinstance(found, NoPose):
         raise TransformError(found.detail)
     return found.pose

@@ -209,11 +209,10 @@ def _library() -> Any:
 def _exr(prediction: Prediction[np.ndarray], path: Path) -> bytes:
     """One float32 channel Z, NaN where there is no depth."""
     library = _library()
-    depth = np.where(prediction.valid, prediction.depth, np.nan).astype(np.float32)
     header = {"compression": library.ZIP_COMPRESSION, "type": library.scanlineimage}
     partial = path.with_name(f".{path.name}.writing.exr")  # the library wants the suffix
     try:
-        with library.File(header, {"Z": depth}) as file:
+        with library.File(header, {"Z": _depth(prediction)}) as file:
             file.write(str(partial))
         return partial.read_bytes()
     except (RuntimeError, ValueError) as error:
@@ -222,10 +221,14 @@ def _exr(prediction: Prediction[np.ndarray], path: Path) -> bytes:
         partial.unlink(missing_ok=True)
 
 
+def _depth(prediction: Prediction[np.ndarray]) -> np.ndarray:
+    """H x W float32, NaN where there is none."""
+    return np.where(prediction.valid, prediction.depth, np.nan).astype(np.float32)
+
+
 def _arrays(frame: SourceFrame, prediction: Prediction[np.ndarray]) -> dict[str, Any]:
-    depth = np.where(prediction.valid, prediction.depth, np.nan).astype(np.float32)
     return {
-        "depth": depth,
+        "depth": _depth(prediction),
         "mask": prediction.valid,
         "camera_matrix": prediction.camera_matrix,
         "metric": prediction.metric,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dyfn_core.data.files import LFS_POINTER
 from dyfn_ros.recordings.errors import RecordingError
 
 KINDS = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3", b"#ROSBAG V2.0\n": ".bag"}
 NAMES = {".mcap": "an MCAP file", ".db3": "an SQLite file", ".bag": "a ROS 1 bag (2.0)"}
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _OTHERS = {
-    b"version https://git-lfs": "a Git LFS pointer: `git lfs pull` fetches the recording",
+    LFS_POINTER: "a Git LFS pointer: `git lfs pull` fetches the recording",
     b"PK\x03\x04": "a zip archive: unpack it",
     b"7z\xbc\xaf\x27\x1c": "a 7z archive: unpack it",
     b"Rar!": "a RAR archive: unpack it",

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from dyfn_core.metric.motion import MotionPoints
-from dyfn_core.metric.point_memory import MemoryOptions, PointMemory, recall, remember, unhidden
+from dyfn_core.metric.point_memory import (
+    MemoryOptions,
+    PointMemory,
+    chosen,
+    recall,
+    remember,
+    unhidden,
+)
 from tests.support.textured_plane import CAMERA, SIZE, pose_at
 
 OPTIONS = MemoryOptions()
@@ -67,7 +74,7 @@ def test_points_that_something_hides_by_now_are_left_out() -> None:
     """A remembered point behind the prediction; not one before it, unknown, or of this frame."""
     found = recall(kept(seen([1, 2, 3, 4])), seen([9], 5.0), CAMERA, np.eye(4), 1.0, SIZE, OPTIONS)
     residuals = np.array([2.0, 0.71, 0.69, -2.0, np.nan])
-    assert unhidden(found, 1, residuals, OPTIONS).ids.tolist() == [9, 2, 3, 4]
+    assert chosen(found, unhidden(residuals, 1, OPTIONS)).ids.tolist() == [9, 2, 3, 4]
 
 
 def test_points_behind_and_beside_the_picture_are_left_out() -> None:
