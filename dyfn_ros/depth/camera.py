@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.data.files import read_table
-from dyfn_core.data.frames import FrameError
+from dyfn_core.data.frames import DataError
+from dyfn_core.data.rgbd.cameras import read_camera
 from dyfn_core.geometry.camera import check_camera_matrix, doubted_intrinsics
 from dyfn_ros.depth.settings import Camera
 from dyfn_ros.depth.source import SourceFrame
@@ -51,12 +51,11 @@ class KnownCamera:
             self._matrix = self._calibration.matrix
             return
         try:
-            values = (
-                read_table(Path(words[0]), 9).ravel()
-                if len(words) == 1
-                else np.array([float(word) for word in words])
-            )
-        except (FrameError, ValueError) as error:
+            if len(words) == 1:
+                values = np.array(read_camera(Path(words[0])).pixels)
+            else:
+                values = np.array([float(word) for word in words])
+        except (DataError, ValueError) as error:
             raise ValueError(f"--camera-matrix {' '.join(words)}: {error}") from error
         if len(values) == 4:
             fx, fy, cx, cy = values

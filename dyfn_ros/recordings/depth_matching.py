@@ -179,8 +179,9 @@ class _Index:
         distance = int(self._stamps[best]) - image.stamp_ns
         if abs(distance) > tolerance_ns:
             return Match(image, None, distance)
-        equal = self._stamps == self._stamps[best]
-        if repeated or len(np.unique(self._marks[equal])) > 1:
+        first = np.searchsorted(self._stamps, self._stamps[best], "left")
+        last = np.searchsorted(self._stamps, self._stamps[best], "right")
+        if repeated or len(np.unique(self._marks[first:last])) > 1:
             return Match(image, None, distance, ambiguous=True)
         return Match(image, self._at(int(self._order[best])), distance)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -70,9 +69,8 @@ class VideoTopic:
         """The pictures that are left at the end; messages without one are lost."""
         if self._decoder is not None:
             yield from self._decode(None)
-        for reason, count in Counter({self._no_picture(): len(self._waiting)}).items():
-            for _ in range(count):
-                self._lose(reason)
+        for _ in self._waiting:
+            self._lose(self._no_picture())
 
     def _no_picture(self) -> str:
         return (
