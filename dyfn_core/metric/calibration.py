@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dyfn_core.metric.fit import Fit, MetricMap, NoFitError, fit_scale, fit_scale_and_shift
+from dyfn_core.metric.plausible import implausible
 from dyfn_core.metric.references import Evidence
 
 MODES = ("hold", "track")
@@ -173,12 +174,18 @@ class ScaleCalibrator:
 
     def _fit(self, window: tuple[Evidence, ...]) -> Fit:
         fit = fit_scale if self.options.fit == "scale" else fit_scale_and_shift
-        return fit(
+        found = fit(
             np.concatenate([one.predicted for one in window]),
             np.concatenate([one.measured for one in window]),
             min_points=self.options.min_points,
             max_spread=self.options.max_spread,
         )
+        middles = [one.middle for one in window if math.isfinite(one.middle)]
+        if middles:
+            metres = float(found.map(np.array(np.median(middles))))
+            if problem := implausible(found.map.scale, metres):
+                raise NoFitError(problem)
+        return found
 
     def _calibrated(self, fit: Fit, now: float) -> ScaleCalibration:
         return replace(

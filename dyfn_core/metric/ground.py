@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from dyfn_core.metric.plausible import middle_depth
 from dyfn_core.metric.references import Evidence
 
 _GRID = 64  # samples along the longer side
@@ -106,7 +107,8 @@ def ground_evidence(
     except NoGroundError as error:
         reason = f"no ground plane ({error.kind})"
         return Evidence(stamp, np.empty(0), np.empty(0), Counter({reason: 1}))
-    return Evidence(stamp, np.array([ground.distance]), np.array([height]))
+    middle = middle_depth(view.points[..., 2], view.valid)
+    return Evidence(stamp, np.array([ground.distance]), np.array([height]), middle=middle)
 
 
 def _thinned(points: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from dyfn_core.geometry.camera import check_camera_matrix
 from dyfn_core.geometry.projection import nearest_pixels
+from dyfn_core.metric.plausible import middle_depth
 
 MOST_POINTS = 400  # of one message; more say the same
+NEARER, FARTHER = "nearer than reference_min_depth", "beyond reference_max_depth"
 _EDGE = 1.2  # depths of neighbouring pixels that differ by more make an edge
 _NEAREST_SHARE = 0.1
 _EMPTY = np.empty(0)
@@ -43,13 +45,28 @@ class Evidence:
     """What one measurement says: N pairs, both float64 and > 0.
 
     stamp: of the predicted frame, seconds. predicted: in the stream's unit. measured: metres.
-    dropped: points that could not be used, by reason.
+    dropped: points that could not be used, by reason. middle: median of the frame's valid
+    predicted depth; NaN unknown.
     """
 
     stamp: float
     predicted: np.ndarray
     measured: np.ndarray
     dropped: Counter[str] = field(default_factory=Counter)
+    middle: float = math.nan
+
+    def within(self, nearest: float, farthest: float) -> Evidence:
+        """Without the pairs whose measured metres are out of bounds, which are counted."""
+        near, far = self.measured < nearest, self.measured > farthest
+        if not near.any() and not far.any():
+            return self
+        good, dropped = ~(near | far), Counter(self.dropped)
+        for reason, out in ((NEARER, near), (FARTHER, far)):
+            if out.any():
+                dropped[reason] += int(out.sum())
+        return replace(
+            self, predicted=self.predicted[good], measured=self.measured[good], dropped=dropped
+        )
 
 
 class Reference(Protocol):
@@ -176,7 +193,12 @@ class ConeReference:
             return Evidence(stamp, _EMPTY, _EMPTY, Counter({"no predicted depth": 1}))
         radial = (view.depth * norm)[usable]
         predicted = float(np.quantile(radial, _NEAREST_SHARE if self.nearest else 0.5))
-        return Evidence(stamp, np.array([predicted]), np.array([distance]))
+        return Evidence(
+            stamp,
+            np.array([predicted]),
+            np.array([distance]),
+            middle=middle_depth(view.depth, view.valid),
+        )
 
 
 def _keep(points: np.ndarray, good: np.ndarray, reason: str, dropped: Counter[str]) -> np.ndarray:
@@ -208,7 +230,8 @@ def _pairs(
         dropped["thinned out"] += len(good) - MOST_POINTS
         good = good[np.linspace(0, len(good) - 1, MOST_POINTS).astype(int)]
     kept = Counter({reason: count for reason, count in dropped.items() if count})
-    return Evidence(stamp, predicted[good], np.asarray(measured, np.float64)[good], kept)
+    measured = np.asarray(measured, np.float64)[good]
+    return Evidence(stamp, predicted[good], measured, kept, middle_depth(view.depth, view.valid))
 
 
 def _at_edge(

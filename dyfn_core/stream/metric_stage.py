@@ -141,7 +141,9 @@ class MetricStage(ScaleStage):
         self._late += sum(when != stamp for when, _ in pairs)
         if frame.stamp is not None:
             kept.append(now)
-        return [reference.evidence(views[when], when) for when, reference in pairs]
+        nearest, farthest = self._options().reference_depths
+        found = (reference.evidence(views[when], when) for when, reference in pairs)
+        return [evidence.within(nearest, farthest) for evidence in found]
 
     def report(self) -> dict[str, str]:
         """See StreamStage."""

@@ -17,6 +17,7 @@ from dyfn_core.metric.motion_scale import (
     MotionScaleState,
     step,
 )
+from dyfn_core.metric.plausible import IMPLAUSIBLE, implausible, middle_depth
 from dyfn_core.metric.references import Reference
 from dyfn_core.metric.scale import ScaleInForce
 from dyfn_core.prediction import Frame, Prediction
@@ -109,6 +110,11 @@ class MotionStage(ScaleStage):
             points=prediction.points * factor[..., None],
         )
         if found.metric is None:
+            return self._without_metres(steady)
+        metres = found.metric * middle_depth(steady.depth, steady.valid)
+        if problem := implausible(found.metric, metres):
+            self.scale = ScaleInForce(self.source, problem=problem)
+            self._unused[IMPLAUSIBLE] += 1
             return self._without_metres(steady)
         return replace(steady.scaled(found.metric), unit=np.float32(found.metric).item())
 

@@ -177,6 +177,20 @@ class StreamOptions:
         "such measurements are not used.",
         range=(0.0, 60.0),
     )
+    reference_min_depth: float = option(
+        SCALE,
+        0.01,
+        "Metres; nearer measurements are not used.",
+        range=(0.0, 1e6),
+        live=True,
+    )
+    reference_max_depth: float = option(
+        SCALE,
+        200.0,
+        "Metres; farther measurements are not used (drivers give large numbers for no return).",
+        range=(0.001, 1e6),
+        live=True,
+    )
     camera_height: float = option(
         SCALE,
         0.0,
@@ -228,6 +242,16 @@ class StreamOptions:
         for name, described in options_of(StreamOptions).items():
             if problem := described.problem(name, getattr(self, name)):
                 raise ValueError(problem)
+        near, far = self.reference_depths
+        if near >= far:
+            raise ValueError(
+                f"reference_min_depth is {near}, expected less than reference_max_depth {far}"
+            )
+
+    @property
+    def reference_depths(self) -> tuple[float, float]:
+        """Metres between which a measured depth is used."""
+        return self.reference_min_depth, self.reference_max_depth
 
     @property
     def time_rules(self) -> TimeRules:

@@ -36,6 +36,8 @@ _REMEDY = {
     True: "expected depth registered to the camera; if it is, set reference_transform to "
     "'0 0 0 0 0 0 1'",
 }
+_NO_RETURN = np.array([65.535, 65535.0])  # metres: the largest number of 16 bits, in mm and in m
+_EXACT = 5e-4  # metres
 _FORMATS = {7: "f4", 8: "f8"}  # sensor_msgs/PointField: FLOAT32, FLOAT64
 # REP 103: a body frame (x forward, y left, z up) seen from an optical one at the same place.
 _BODY_TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -154,7 +156,8 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 def decode_points(message: Any) -> np.ndarray:
     """sensor_msgs/PointCloud2 -> N x 3 float64, the sensor's frame; non-finite values stay.
 
-    x, y, z may be FLOAT32 or FLOAT64 at any offset, rows may be padded, either byte order.
+    x, y, z may be FLOAT32 or FLOAT64 at any offset, rows may be padded, either byte order. A
+    distance or a coordinate of 65.535 or 65535 m is a sensor's word for no return: NaN.
     Raises MessageError when a coordinate is absent, or the data has not the bytes it should.
     """
     fields = {field.name: field for field in message.fields}
@@ -189,7 +192,19 @@ def decode_points(message: Any) -> np.ndarray:
         )
     rows = data[: row_step * height].reshape(height, row_step)[:, : step * width]
     cloud = np.ascontiguousarray(rows).reshape(-1).view(layout)
-    return np.column_stack([cloud[axis].astype(np.float64) for axis in "xyz"])
+    points = np.column_stack([cloud[axis].astype(np.float64) for axis in "xyz"])
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(points, axis=1)
+    nothing = _no_return(distance) | _no_return(np.abs(points)).any(axis=1)
+    return np.where(nothing[:, None], np.nan, points)
+
+
+def _no_return(distance: np.ndarray) -> np.ndarray:
+    """Where a driver has written its largest number, since nothing was seen."""
+    found = np.zeros(distance.shape, bool)
+    for number in _NO_RETURN:
+        found |= np.abs(distance - number) < _EXACT
+    return found
 
 
 def decode_scan(message: Any) -> np.ndarray:
@@ -197,6 +212,7 @@ def decode_scan(message: Any) -> np.ndarray:
     ranges = np.asarray(message.ranges, np.float64)
     angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
     good = np.isfinite(ranges) & (ranges >= message.range_min) & (ranges <= message.range_max)
+    good &= ~_no_return(ranges)
     ranges = np.where(good & (ranges > 0), ranges, np.nan)
     return np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles), 0 * ranges])
 
@@ -211,13 +227,15 @@ def decode_range(message: Any) -> tuple[float, float, bool]:
         raise MessageError(f"field_of_view is {view}, expected radians in 0..pi")
     distance = float(message.range)
     good = math.isfinite(distance) and message.min_range <= distance <= message.max_range
+    good = good and not _no_return(np.array(distance))
     return distance if good else math.nan, view / 2, int(message.radiation_type) == ULTRASOUND
 
 
 def decode_reference(message: Any, kind: str, transform: Transform) -> Reference:
     """A measurement of a message of this type; raises MessageError."""
     if kind == IMAGE:
-        return DepthReference(messages.decode_depth(message))
+        depth = messages.decode_depth(message)
+        return DepthReference(np.where(_no_return(depth), np.nan, depth))
     if kind == "Range":
         distance, half_angle, sound = decode_range(message)
         hit = transform(np.array([[distance, 0.0, 0.0]]))[0]

@@ -219,7 +219,11 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
 SPECS: dict[str, Spec] = {entry.name: spec_of(entry) for entry in fields(NodeSettings)}
 
 # Pairs of a lower and an upper limit; an upper limit of 0 is none.
-LIMITS = (("min_depth", "max_depth"), ("points_min_depth", "points_max_depth"))
+LIMITS = (
+    ("min_depth", "max_depth"),
+    ("points_min_depth", "points_max_depth"),
+    ("reference_min_depth", "reference_max_depth"),
+)
 
 
 def show(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -187,3 +188,25 @@ def test_late_evidence_counts_as_if_it_had_come_in_time() -> None:
     assert late.state.stamp == in_time.state.stamp == stamps[-1]
     assert late.state.map is not None
     assert late.state.map.scale == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("scale", [1e38, 1e4, 1e-4])
+@pytest.mark.parametrize("mode", ["hold", "track"])
+def test_a_scale_of_no_camera_s_world_is_refused_and_the_next_good_one_taken(
+    scale: float, mode: str
+) -> None:
+    """Two units of depth in the middle of a picture are neither 20 km nor 0.2 mm."""
+    calibrator = ScaleCalibrator(CalibrationOptions(mode=mode))
+    for step in range(30):
+        calibrator.push(replace(evidence(step / 10, scale), middle=2.0))
+    assert calibrator.state.map is None
+    assert "implausible scale" in calibrator.state.problem
+    assert "expected 0.005 to 2000" in calibrator.state.problem
+    for step in range(30, 50):
+        calibrator.push(replace(evidence(step / 10, 2.5), middle=2.0))
+    assert calibrator.state.map is not None
+    assert calibrator.state.map.scale == pytest.approx(2.5, rel=0.02)
+    for step in range(50, 120):
+        calibrator.push(replace(evidence(step / 10, scale), middle=2.0))
+    assert calibrator.state.map.scale == pytest.approx(2.5, rel=0.02)
+    assert calibrator.state.problem

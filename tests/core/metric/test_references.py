@@ -140,3 +140,17 @@ def test_cone_that_hits_nothing_visible_is_counted(
     found = ConeReference(np.array(hit), 0.1, nearest=True).evidence(slanted, 0.0)
     assert not len(found.predicted)
     assert found.dropped == {reason: 1}
+
+
+def test_measurements_out_of_bounds_are_counted_and_not_used(slanted: View) -> None:
+    rows, columns = np.array([3, 20, 40, 30]), np.array([5, 30, 60, 50])
+    metres = slanted.points[rows, columns] * np.array([1.0, 1e38, 1e6, 1e-3])[:, None]
+    whole = PointReference(metres).evidence(slanted, 0.0)
+    found = whole.within(0.01, 200.0)
+    np.testing.assert_allclose(found.measured, slanted.depth[rows[:1], columns[:1]], rtol=1e-6)
+    np.testing.assert_allclose(found.predicted, found.measured, rtol=1e-6)
+    assert dict(found.dropped) == {
+        "beyond reference_max_depth": 2,
+        "nearer than reference_min_depth": 1,
+    }
+    assert found.middle == pytest.approx(2.0, rel=0.05)

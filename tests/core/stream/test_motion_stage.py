@@ -150,6 +150,19 @@ def test_poses_that_contradict_the_pictures_give_no_metres() -> None:
     assert "contradicts the pictures: reprojection error" in session.problems()[0]
 
 
+def test_an_odometry_in_no_metres_gives_no_metres(
+    walked: list[tuple[Frame, np.ndarray]],
+) -> None:
+    session = session_of()
+    for frame, _ in walked:
+        assert frame.pose is not None
+        pose = frame.pose.copy()
+        pose[:3, 3] *= 1e4
+        assert not session.push(replace(frame, pose=pose)).metric
+    assert session.unused_references["implausible scale"] >= 1
+    assert "implausible scale" in session.problems()[0]
+
+
 def test_unknown_intrinsics_and_stamps(walked: list[tuple[Frame, np.ndarray]]) -> None:
     session = session_of()
     frame = walked[0][0]

@@ -79,6 +79,40 @@ def test_stale_and_early_measurements_are_counted() -> None:
     assert report["scale: not used, future-dated"] == "1"
 
 
+def test_absurd_measurements_give_no_metres_and_are_said() -> None:
+    """Points at 1e38 m, and a driver's 1e6 for no return, among good ones and alone."""
+    session = session_of(
+        metric_source="reference",
+        calibration_seconds=0.2,
+        frozen_after=0.0,  # the same picture again and again
+        stabilize=False,
+    )
+    depth = push(session, picture(0), 0.0).depth[::4, ::4]
+    rows, columns = np.mgrid[0 : 4 * depth.shape[0] : 4, 0 : 4 * depth.shape[1] : 4]
+    camera = push(session, picture(0), 0.1).camera_matrix
+    rays = np.stack(
+        [
+            (columns - camera[0, 2]) / camera[0, 0],
+            (rows - camera[1, 2]) / camera[1, 1],
+            np.ones(rows.shape),
+        ],
+        -1,
+    )
+    for index in range(2, 12):
+        absurd = rays * (1e38 if index % 2 else 1e6)
+        session.add_reference(index / 10, PointReference(absurd.reshape(-1, 3)))
+        assert not push(session, picture(0), index / 10).metric
+    assert session.unused_references["beyond reference_max_depth"] > 50
+    assert "beyond reference_max_depth" in session.problems()[0]
+    for index in range(12, 18):
+        measured = rays * (2.5 * depth)[..., None]
+        measured[::3] = rays[::3] * 1e38
+        session.add_reference(index / 10, PointReference(measured.reshape(-1, 3)))
+        push(session, picture(0), index / 10)
+    assert session.scale.map is not None
+    assert session.scale.map.scale == pytest.approx(2.5, rel=0.1)
+
+
 def test_the_camera_s_height_over_a_floor_gives_metres() -> None:
     """A floor 0.5 units below a level camera that is 1.5 m above it."""
     model = PinholeModel()

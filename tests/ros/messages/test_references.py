@@ -286,3 +286,18 @@ def test_messages_of_recordings_are_read_as_well() -> None:
         data=np.frombuffer(message.data, np.uint8),
     )
     np.testing.assert_array_equal(decode_points(plain), POINTS)
+
+
+@pytest.mark.parametrize("number", [65.535, 65535.0])
+def test_a_driver_s_largest_number_is_no_distance(number: float) -> None:
+    points = decode_points(cloud([(1, 2, 3), (0, 0, number), (number, 1, 1)], step=16))
+    assert np.isfinite(points).all(axis=1).tolist() == [True, False, False]
+    scan = LaserScan(range_min=0.1, range_max=1e6, ranges=[1.0, number], angle_increment=0.1)
+    assert np.isfinite(decode_scan(scan)).all(axis=1).tolist() == [True, False]
+    sonar = Range(range=number, min_range=0.0, max_range=1e6, field_of_view=0.1)
+    assert math.isnan(decode_range(sonar)[0])
+    row = np.array([1.0, number], "<f4")
+    image = Image(encoding="32FC1", height=1, width=2, step=8, data=array.array("B", row.tobytes()))
+    found = decode_reference(image, "Image", parse_transform("", "Image"))
+    assert isinstance(found, DepthReference)
+    assert np.isfinite(found.depth).tolist() == [[True, False]]
