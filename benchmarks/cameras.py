@@ -27,17 +27,27 @@ PATIENCE = 180.0
 
 
 class Feeder:
-    """Keeps one frame of each camera under way and counts what comes back."""
+    """Keeps one frame of each camera under way and counts what comes back.
 
-    def __init__(self, cameras: list[str], images: list[np.ndarray], namespace: str) -> None:
+    everything: subscribe to all outputs, not to depth and cloud alone.
+    """
+
+    def __init__(
+        self,
+        cameras: list[str],
+        images: list[np.ndarray],
+        namespace: str,
+        everything: bool = False,
+    ) -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import QoSProfile
-        from sensor_msgs.msg import Image, PointCloud2
+        from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
         from std_srvs.srv import Trigger
 
         self.count = dict.fromkeys(cameras, 0)
         self.latency: list[float] = []
+        self.others = 0  # messages of the other outputs
         self._sent: dict[str, float] = {}
         self._messages = [self._message(image) for image in images]
         self._other = [self._message(np.ascontiguousarray(image[::2, ::2])) for image in images]
@@ -51,11 +61,20 @@ class Feeder:
             self._node.create_subscription(
                 Image, f"{prefix}/depth/image", lambda _, c=camera: self._take(c), qos
             )
-            self._node.create_subscription(PointCloud2, f"{prefix}/points", lambda _: None, qos)
+            others = {"points": PointCloud2}
+            if everything:
+                others["depth/camera_info"] = CameraInfo
+                others["depth/image/compressedDepth"] = CompressedImage
+                others["depth/colored"] = Image
+            for topic, kind in others.items():
+                self._node.create_subscription(kind, f"{prefix}/{topic}", self._count_other, qos)
         self._request = Trigger.Request()
         self._reset = self._node.create_client(Trigger, f"{namespace}/stream_depth/reset")
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
+
+    def _count_other(self, _: Any) -> None:
+        self.others += 1
 
     @staticmethod
     def _message(rgb: np.ndarray) -> Any:

@@ -1,8 +1,9 @@
 """Memory and latency of the node over many frames: flat and stable, or not.
 
-    python benchmarks/soak.py [--frames 20000] [--size 64x48] [--model dyfn-mini] [--out soak.json]
+    python benchmarks/soak.py [--frames 20000] [--size 640x480] [--model dyfn-mini]
+        [--num-tokens 0] [--out soak.json]
 
-Frames go over DDS one at a time, with subscribers on depth and cloud. Resident memory and latency
+Frames go over DDS one at a time, with a subscriber on every output. Resident memory and latency
 are taken in ten stretches; between two of them the stream is reset or the images change their size
 (half, or back). Exit code 1 when memory grows by more than --grow MB from the second stretch to
 the last, or the median latency of the last stretch is more than 1.5 times that of the first one of
@@ -21,6 +22,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from cameras import Feeder
 
@@ -42,6 +44,7 @@ def stretch(feeder: Feeder, process: NodeProcess, frames: int) -> dict[str, floa
     """So many frames of the one camera. A reset drops the frame that waits: it is sent again."""
     first, last = feeder.count["camera"], time.monotonic()
     feeder.latency.clear()
+    feeder.others = 0
     seen, dropped = first, 0
     while feeder.count["camera"] - first < frames:
         feeder.spin()
@@ -57,10 +60,19 @@ def stretch(feeder: Feeder, process: NodeProcess, frames: int) -> dict[str, floa
     return {
         "frames": feeder.count["camera"],
         "dropped": dropped,
+        "other_outputs": feeder.others,
         "resident_mb": resident(process.pid),
         "latency_p50_ms": statistics.median(feeder.latency) * 1e3,
         "latency_p99_ms": float(np.quantile(feeder.latency, 0.99)) * 1e3,
     }
+
+
+def pictures(width: int, height: int) -> list[np.ndarray]:
+    """A view that drifts to the right and back: no scene cuts."""
+    coarse = np.random.default_rng(0).integers(0, 256, (height // 16, width // 16, 3))
+    view = cv2.resize(coarse.astype(np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
+    steps = [*range(8), *range(6, 0, -1)]
+    return [np.roll(view, step * width // 200, axis=1) for step in steps]
 
 
 def soak(options: argparse.Namespace) -> list[dict[str, float]]:
@@ -68,8 +80,7 @@ def soak(options: argparse.Namespace) -> list[dict[str, float]]:
     import rclpy
 
     width, height = (int(part) for part in options.size.split("x"))
-    rng = np.random.default_rng(0)
-    images = [rng.integers(0, 256, (height, width, 3), dtype=np.uint8) for _ in range(8)]
+    images = pictures(width, height)
     parameters: dict[str, Any] = {
         "model": options.model,
         "cameras": "[camera]",
@@ -84,14 +95,16 @@ def soak(options: argparse.Namespace) -> list[dict[str, float]]:
         NodeProcess(Path(folder) / "node.log", parameters, namespace) as process,
     ):
         rclpy.init()
-        feeder = Feeder(["camera"], images, namespace)
+        feeder = Feeder(["camera"], images, namespace, everything=True)
         try:
             feeder.prime(process)
             rows = []
             for index in range(STRETCHES):
                 rows.append(stretch(feeder, process, options.frames // STRETCHES))
                 print(
-                    f"{rows[-1]['frames']:7.0f} frames  {rows[-1]['resident_mb']:7.1f} MB  "
+                    f"{rows[-1]['frames']:7.0f} frames  "
+                    f"{rows[-1]['other_outputs']:7.0f} other messages  "
+                    f"{rows[-1]['resident_mb']:7.1f} MB  "
                     f"p50 {rows[-1]['latency_p50_ms']:6.1f} ms  "
                     f"p99 {rows[-1]['latency_p99_ms']:6.1f} ms",
                     flush=True,
@@ -110,7 +123,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", default="dyfn-mini")
     parser.add_argument("--frames", type=int, default=20_000)
-    parser.add_argument("--size", default="64x48")
+    parser.add_argument("--size", default="640x480")
     parser.add_argument("--num-tokens", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--grow", type=float, default=20.0)

@@ -1,4 +1,4 @@
-"""ros2 launch dyfn_ros stream_depth.launch.py image:=/camera/image_raw [rviz:=true]
+"""ros2 launch dyfn_ros stream_depth.launch.py image:=/camera/image_raw [rviz:=true frame:=camera]
 
 One camera; may be included by other launch files. For an installation with ROS launch; without
 it, run `stream_depth --ros-args -r image:=...`.
@@ -21,7 +21,10 @@ ARGUMENTS = {
     "autostart": ("true", "Configure and activate at start; false: leave it to a manager."),
     "use_sim_time": ("false", "Take the time from /clock."),
     "rviz": ("false", "Start RViz with image, depth and cloud."),
+    "frame": ("camera", "RViz: the images' frame_id, or a frame that tf connects with it."),
 }
+
+SHOWN = ("stream_depth/depth/image", "stream_depth/points")  # by stream_depth.rviz
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -50,11 +53,13 @@ def generate_launch_description() -> LaunchDescription:
         remappings=[("image", image), ("camera_info", LaunchConfiguration("camera_info"))],
         output="screen",
     )
+    view = PathJoinSubstitution([CONFIG, "stream_depth.rviz"])
     rviz = Node(
         package="rviz2",
         executable="rviz2",
-        arguments=["-d", PathJoinSubstitution([CONFIG, "stream_depth.rviz"])],
-        remappings=[("/image", image)],
+        namespace=LaunchConfiguration("namespace"),  # relative names are then the node's
+        arguments=["-d", view, "-f", LaunchConfiguration("frame")],
+        remappings=[("/camera/image_raw", image), *((f"/{topic}", topic) for topic in SHOWN)],
         condition=IfCondition(LaunchConfiguration("rviz")),
     )
     return LaunchDescription([*declared, params_file, node, rviz])

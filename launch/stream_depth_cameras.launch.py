@@ -7,8 +7,10 @@ other names are given by `image` and `camera_info`, below the camera's name.
 import yaml
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS = {
     "cameras": ("[front, left]", "Names of the cameras, as a YAML list."),
@@ -16,7 +18,10 @@ ARGUMENTS = {
     "camera_info": ("camera_info", "Their CameraInfos, below /CAMERA/."),
     "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
     "params_file": ("", "Parameter file of the node, such as config/cameras/two_cameras.yaml."),
+    "rviz": ("false", "Start an RViz for each camera, with its image, depth and cloud."),
+    "frame": ("camera", "RViz: a frame that tf connects with the frame_id of the images."),
 }
+SHOWN = ("depth/image", "points")  # by stream_depth.rviz
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -28,15 +33,27 @@ def nodes(context: LaunchContext) -> list[Node]:
         for camera in cameras
         for ours, theirs in (("image", "image"), ("camera_info", "camera_info"))
     ]
-    return [
-        Node(
-            package="dyfn_ros",
-            executable="stream_depth",
-            parameters=[*files, {"cameras": cameras, "model": values["model"]}],
-            remappings=remappings,
-            output="screen",
-        )
-    ]
+    node = Node(
+        package="dyfn_ros",
+        executable="stream_depth",
+        parameters=[*files, {"cameras": cameras, "model": values["model"]}],
+        remappings=remappings,
+        output="screen",
+    )
+    return [node, *(rviz(camera, values["image"]) for camera in cameras)]
+
+
+def rviz(camera: str, image: str) -> Node:
+    shown = [(f"/stream_depth/{name}", f"/stream_depth/{camera}/{name}") for name in SHOWN]
+    view = PathJoinSubstitution([FindPackageShare("dyfn_ros"), "config", "stream_depth.rviz"])
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        name=f"rviz_{camera}",
+        arguments=["-d", view, "-f", LaunchConfiguration("frame")],
+        remappings=[("/camera/image_raw", f"/{camera}/{image}"), *shown],
+        condition=IfCondition(LaunchConfiguration("rviz")),
+    )
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -27,6 +27,7 @@ from dyfn_ros.recordings.typestore import TYPES, Lens, compressed_message
 from dyfn_ros.recordings.writer import RecordingWriter
 from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL
+from tests.support import views
 from tests.support.tiny_model import load_tiny
 from tests.support.wall_walk import CAMERA, SIZE, WALL, camera_pose
 
@@ -167,6 +168,29 @@ def test_clouds_are_in_metres_of_the_world(tmp_path: Path) -> None:
     assert topics - {"/stream_depth/scale", "/stream_depth/abs_rel"} <= {*found}
     assert panels["3D!world"]["followTf"] == "world"
     assert "to 4" in panels["Image!depth"]["foxglovePanelTitle"]
+
+
+@pytest.mark.parametrize("form", ["mcap", "raw"])
+def test_what_rviz_and_foxglove_show_is_in_the_file(tmp_path: Path, form: str) -> None:
+    with RecordingWriter(tmp_path / "walk") as writer:
+        for frame in walk(3):
+            stamp = frame.stamp_ns
+            writer.write_jpeg("/camera/image_raw/compressed", frame.image, stamp, "optical")
+            writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, stamp, "optical")
+            writer.write_depth("/camera/depth/image", frame.depth_m, stamp, "optical")
+            writer.write_transform(frame.pose, stamp, "map", "optical")
+    replay(tmp_path / "walk", tmp_path / "out", "--write", form)
+    topics = open_storage(tmp_path / "out" / "output.mcap").topics
+    shown = list(views.of_foxglove(tmp_path / "out" / "output.foxglove.json"))
+    if form == "mcap":
+        shown += views.of_rviz(views.CONFIG / "replay.rviz")
+        assert topics["/tf"].count == 3
+    else:  # as the node publishes it
+        live = views.of_rviz(views.CONFIG / "stream_depth.rviz")
+        shown += [one for one in live if one.topic.startswith("/stream_depth/")]
+    for one in shown:
+        assert topics[one.topic].kind == one.kind, one
+        assert one.fixed is not False, one
 
 
 def enlarged(count: int) -> list[FrameToRecord]:
