@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | lint | coverage | bench | wheel | gpu-train    (see README.md)
+# make setup | demo | test | test-fast | lint | coverage | docs | bench | wheel | gpu-train    (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test test-fast coverage lint bench wheel gpu-train clean
+.PHONY: setup demo test test-fast coverage lint docs bench wheel gpu-train clean
 
 setup: $(READY)
 
@@ -33,6 +33,9 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(READY)
+	$(BIN)/mkdocs build --quiet
 
 bench: $(READY)
 	$(BIN)/python benchmarks/speed.py

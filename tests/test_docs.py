@@ -81,7 +81,7 @@ def missing_module(name: str) -> bool:
 def commands(text: str) -> Iterator[list[str]]:
     """The words of every command line of this project in the code blocks and spans of a page."""
     text = re.sub(r"\\\n\s*", " ", text)
-    lines = re.findall(r"^ {4}(dyfn-\w+ .+)$", text, flags=re.MULTILINE)
+    lines = re.findall(r"^(?: {4})?(dyfn-\w+ .+)$", text, flags=re.MULTILINE)
     lines += re.findall(r"`(dyfn-\w+ [^`\n]+)`", text)
     for line in lines:
         yield shlex.split(line.replace("[", " ").replace("]", " "), comments=True)
