@@ -1,7 +1,7 @@
-"""What `make docs` adds to the pages of docs/: the README as the first page, and pages that lie elsewhere.
+"""What `make docs` adds to the pages of docs/: the README and other pages that lie elsewhere.
 
-Links are written for the repository. Here those to pages of the site follow their pages, and those to
-other files of the repository become plain text, since the site does not have them.
+Links are written for the repository. Here those to pages of the site follow their pages, and those
+to other files of the repository become plain text, since the site does not have them.
 """
 
 from __future__ import annotations
