@@ -35,7 +35,7 @@ from dyfn_core.evaluation.benchmarks.registry import (
 )
 from dyfn_core.evaluation.benchmarks.report import role, write_benchmark_report
 from dyfn_core.evaluation.benchmarks.run import Scoring, evaluate
-from dyfn_core.evaluation.benchmarks.table import write_json, write_results
+from dyfn_core.evaluation.benchmarks.table import metres_table, write_json, write_results
 from dyfn_core.evaluation.report.html import text_table
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.scoring.protocols import ALL_PIXELS
@@ -89,6 +89,7 @@ def _model(options: argparse.Namespace) -> Method:
         controls=options.controls,
         num_tokens=options.num_tokens,
         known_camera=options.known_camera,
+        metres_from=tuple(dict.fromkeys(options.metres_from)),
     )
 
 
@@ -155,7 +156,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     table = write_results(results, options.out, _title(opened), options.ablations)
     path = options.out / "report.html"
     write_benchmark_report(path, _title(opened), table, results, pictures, method.seconds)
-    code = _finish(text_table(table), results, options.out)
+    tables = [table, metres_table(results)]
+    printed = "\n\n".join(text_table(found) for found in tables if found.rows)
+    code = _finish(printed, results, options.out)
     return PARTIAL if options.strict and results["warnings"] else code
 
 

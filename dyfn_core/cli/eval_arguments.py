@@ -19,6 +19,7 @@ from dyfn_core.cli.arguments import (
     add_stride,
     renamed,
 )
+from dyfn_core.evaluation.benchmarks.metres import METRES
 from dyfn_core.evaluation.benchmarks.registry import AUTO, LAYOUTS
 from dyfn_core.quantities import QUANTITIES
 from dyfn_core.scoring.protocols import FITS, L1
@@ -94,6 +95,14 @@ def add_run(command: argparse.ArgumentParser, given: Options | None = None) -> N
     add_num_tokens(group)
     group.add_argument(
         "--known-camera", action="store_true", help="give the model the benchmark's intrinsics"
+    )
+    group.add_argument(
+        "--metres-from",
+        nargs="+",
+        choices=METRES,
+        default=[],
+        help="also score it in metres, by the points that the benchmark gives (VOID), or by points "
+        "that are triangulated with its poses",
     )
     add_device(group)
 

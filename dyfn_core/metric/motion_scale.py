@@ -85,6 +85,8 @@ class MotionFrame:
         pose_variance: rotation (rad^2) and translation (m^2) per axis, accumulated along the way
             to the pose; None when unknown.
         visible: H x W bool, where the image shows something; None: everywhere.
+        points: of another system, such as a visual-inertial odometry. Nothing is then tracked or
+            remembered, and the pose is not used; None: tracked and triangulated here.
     """
 
     image: np.ndarray
@@ -95,6 +97,7 @@ class MotionFrame:
     valid: np.ndarray
     pose_variance: tuple[float, float] | None = None
     visible: np.ndarray | None = None
+    points: MotionPoints | None = None
 
 
 @dataclass(frozen=True)
@@ -190,15 +193,7 @@ def step(
             camera's, the pose is not 4 x 4, or the stamp is not finite.
     """
     _check(frame)
-    motion, points = observe(
-        state.motion,
-        frame.image,
-        frame.camera_matrix,
-        frame.pose,
-        options.motion,
-        frame.pose_variance,
-        frame.visible,
-    )
+    motion, points = _seen(state.motion, frame, options)
     elapsed = 0.0 if state.stamp is None else max(frame.stamp - state.stamp, 0.0)
     state = replace(_doubted(state, points, elapsed, options), motion=motion, stamp=frame.stamp)
     seen = len(points.ids)
@@ -225,6 +220,23 @@ def step(
         problem=points.problem or _doubt_problem(state, options),
     )
     return state, found
+
+
+def _seen(
+    state: MotionState, frame: MotionFrame, options: MotionScaleOptions
+) -> tuple[MotionState, MotionPoints]:
+    """The frame's own points, given or triangulated."""
+    if frame.points is not None:
+        return replace(state, posed=False), frame.points
+    return observe(
+        state,
+        frame.image,
+        frame.camera_matrix,
+        frame.pose,
+        options.motion,
+        frame.pose_variance,
+        frame.visible,
+    )
 
 
 def _check(frame: MotionFrame) -> None:

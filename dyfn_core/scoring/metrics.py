@@ -15,6 +15,8 @@ METRICS = (
     "rmse_log",
     "i_rmse",
     "silog",
+    "mae",
+    "i_mae",
 )
 
 
@@ -23,11 +25,12 @@ def depth_metrics(
 ) -> dict[str, float]:
     """All METRICS over the valid pixels of one frame.
 
-    prediction, target: same shape, positive depth in the same unit (metres for rmse and sq_rel).
+    prediction, target: same shape, positive depth in the same unit (metres for rmse, mae, sq_rel).
     mask: same shape bool, True where the pixel counts; None counts all of them.
 
     abs_rel = mean |d - p| / d; deltaK = share with max(p / d, d / p) < 1.25^K; rmse in the unit
-    of depth, i_rmse in its inverse; rmse_log natural, log10 = mean |log10 p - log10 d|;
+    of depth, i_rmse in its inverse, mae and i_mae = mean |p - d| likewise; rmse_log natural,
+    log10 = mean |log10 p - log10 d|;
     silog = 100 * standard deviation of log p - log d.
     Raises ValueError on differing shapes, no pixel to score, or depth that is not positive.
     """
@@ -46,6 +49,8 @@ def depth_metrics(
         "rmse_log": float(np.sqrt(np.mean(log_error**2))),
         "i_rmse": float(np.sqrt(np.mean((1 / p - 1 / d) ** 2))),
         "silog": float(100 * np.std(log_error)),
+        "mae": float(np.mean(np.abs(error))),
+        "i_mae": float(np.mean(np.abs(1 / p - 1 / d))),
     }
 
 

@@ -176,3 +176,45 @@ def make_video(folder: Path, name: str, frames: int, size: tuple[int, int] = (48
     truth = np.stack([depth(i, (size[0] // 2, size[1] // 2)) for i in range(frames)])[:, None]
     truth[:, :, PATCH[0], PATCH[1]] = -1
     np.savez(folder / f"{name}_disparity.npz", disparity=truth)
+
+
+VOID_SIZE = (24, 32)
+VOID_CAMERA = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
+VOID_SEQUENCE = "classroom0"
+
+
+def make_void(release: Path, density: int, frames: int, scored: list[int]) -> Path:
+    """One test sequence: a sparse point on every fourth pixel of every fourth row.
+
+    The first of these is invalid by its map alone. Frame 1 has no pose. Frame i is at 100 + i / 30
+    seconds; 9.9 s comes first in time and not by name.
+    """
+    folder = release / f"void_{density}"
+    sequence = folder / "data" / VOID_SEQUENCE
+    lines = []
+    for i in range(frames):
+        name = void_name(i)
+        write_image(sequence / "image" / name, image(i, VOID_SIZE))
+        write_depth(sequence / "ground_truth" / name, depth(i, VOID_SIZE), 256)
+        points = np.zeros(VOID_SIZE)
+        points[::4, ::4] = depth(i, VOID_SIZE)[::4, ::4]
+        write_uint16(sequence / "sparse_depth" / name, np.round(points * 256))
+        valid = np.where(points > 0, 256, 0)
+        valid[0, 0] = 0
+        write_uint16(sequence / "validity_map" / name, valid)
+        if i != 1:
+            write_matrix(sequence / "absolute_pose" / f"{name[:-4]}.txt", pose(i)[:3])
+        if i in scored:
+            lines.append(f"void_{density}/data/{VOID_SEQUENCE}/image/{name}")
+    write_matrix(sequence / "K.txt", VOID_CAMERA)
+    (folder / "test_image.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def void_name(index: int) -> str:
+    return f"{9.9 if index == 0 else 100 + index / 30:.4f}.png"
+
+
+def write_uint16(path: Path, values: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), values.astype(np.uint16))

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from dyfn_core.data.frames import DataError
+from dyfn_core.evaluation.benchmarks.metres import MetresStream
 from dyfn_core.evaluation.benchmarks.predictions import Predict
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
 from dyfn_core.models.base import GeometryModel, image_to_batch
@@ -26,6 +28,7 @@ class ModelMethod:
     stabilize: False leaves the DyFN variant out. controls: False leaves the moving average and the
     frozen statistics out. num_tokens: None for the model's default. known_camera: tell the stream
     the benchmark's intrinsics; otherwise, as in the paper, it finds the focal length itself.
+    metres_from: some of metres.METRES: the first variant again, in metres by these.
     The image is encoded once for all variants; each has a DepthStream of its own, and the encoding
     counts in the time of each.
     """
@@ -39,7 +42,10 @@ class ModelMethod:
         controls: bool = True,
         num_tokens: int | None = None,
         known_camera: bool = False,
+        metres_from: Sequence[str] = (),
     ) -> None:
+        if metres_from and model.quantity == DISPARITY:
+            raise DataError(f"{name} predicts disparity: no metres can be given to it")
         self.model = model
         self.num_tokens = num_tokens
         self.known_camera = known_camera
@@ -50,7 +56,9 @@ class ModelMethod:
         if controls:
             found = latent_controls(model)
             self._stabilizers |= {f"control: {kind}": found[kind] for kind in found}
-        self._seconds = {name: array("d") for name in self._stabilizers}
+        self._first = next(iter(self._stabilizers))
+        self._metres = {f"{self._first} + {source}": source for source in metres_from}
+        self._seconds = {name: array("d") for name in self.variants}
 
     @property
     def quantity(self) -> str:
@@ -60,7 +68,12 @@ class ModelMethod:
     @property
     def variants(self) -> tuple[str, ...]:
         """See predictions.Method."""
-        return tuple(self._stabilizers)
+        return (*self._stabilizers, *self._metres)
+
+    @property
+    def in_metres(self) -> tuple[str, ...]:
+        """See predictions.Method."""
+        return tuple(self._metres)
 
     @property
     def seconds(self) -> Mapping[str, Sequence[float]]:
@@ -70,6 +83,7 @@ class ModelMethod:
     def open(self, sequence: BenchmarkSequence) -> Predict:
         """See predictions.Method; every sequence begins with fresh streams."""
         streams: dict[str, DepthStream] = {}
+        metres = {name: MetresStream(kind, sequence.name) for name, kind in self._metres.items()}
 
         @torch.inference_mode()
         def predict(index: int, frame: BenchmarkFrame) -> dict[str, np.ndarray]:
@@ -88,6 +102,11 @@ class ModelMethod:
                 affine, state = decode_with(self.model, stabilizer, latent, state)
                 found[name] = as_array(stream.finish(affine, state, float(index)))
                 self._seconds[name].append(encoding + time.perf_counter() - start)
+            for name, metric in metres.items():
+                start = time.perf_counter()
+                found[name] = metric.push(index, frame, found[self._first])
+                seconds = self._seconds[self._first][-1] + time.perf_counter() - start
+                self._seconds[name].append(seconds)
             return found
 
         return predict

@@ -14,7 +14,7 @@ from dyfn_core.data.files import read_exr, read_uint16
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.arrays import frames_of_array, npz_key
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame, BenchmarkSequence
-from dyfn_core.quantities import scored_quantity, scored_values
+from dyfn_core.quantities import DISPARITY, scored_quantity, scored_values
 
 ARRAYS = (".npz", ".npy")
 FRAME_FILES = (".npz", ".npy", ".png", ".exr")
@@ -28,7 +28,8 @@ class Method(Protocol):
     """What can be scored: one or several predictions of each frame.
 
     quantity: "depth" (scored after scale and shift in depth) or "disparity" (scale and shift in
-    disparity). variants: the predictions' names, the rows of a table. seconds: what every frame
+    disparity). variants: the predictions' names, the rows of a table. in_metres: those of them that
+    are in metres, or may be. seconds: what every frame
     so far took, by variant, where the method was run here; empty for files.
     """
 
@@ -37,6 +38,9 @@ class Method(Protocol):
 
     @property
     def variants(self) -> tuple[str, ...]: ...
+
+    @property
+    def in_metres(self) -> tuple[str, ...]: ...
 
     @property
     def seconds(self) -> Mapping[str, Sequence[float]]: ...
@@ -74,6 +78,11 @@ class ArrayMethod:
     def variants(self) -> tuple[str, ...]:
         """See Method."""
         return (self.name,)
+
+    @property
+    def in_metres(self) -> tuple[str, ...]:
+        """See Method."""
+        return () if self.quantity == DISPARITY else self.variants
 
     @property
     def seconds(self) -> Mapping[str, Sequence[float]]:

@@ -19,6 +19,7 @@ from dyfn_core.evaluation.benchmarks.sets import (
     seven_scenes,
     sintel,
     tum,
+    void,
 )
 from dyfn_core.evaluation.benchmarks.sets.base import (
     UNREADABLE,
@@ -100,6 +101,16 @@ BENCHMARKS = {
             seven_scenes.open_seven_scenes,
             seven_scenes.SEQUENCES,
             video_set="7scenes",
+        ),
+        *(
+            Benchmark(
+                f"void-{density}",
+                f"VOID, {density} points",
+                void.EXPECTED.replace("<density>", str(density)),
+                void.SETTINGS,
+                partial(void.open_void, density=density),
+            )
+            for density in void.DENSITIES
         ),
         Benchmark("rgbd", "RGB-D folder", rgbd.EXPECTED, rgbd.SETTINGS, rgbd.open_rgbd),
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from dyfn_core.evaluation.benchmarks.model_method import BASE
 from dyfn_core.evaluation.benchmarks.pictures import STRIPS, BenchmarkPictures, WorstFrame
-from dyfn_core.evaluation.benchmarks.table import sequence_table
+from dyfn_core.evaluation.benchmarks.table import metres_table, sequence_table
 from dyfn_core.evaluation.report.html import Cell, Part, Section, Table, Text, write_report
 from dyfn_core.evaluation.report.sequence import latency_section
 from dyfn_core.evaluation.report.variants import Role, Variant, headline, key_figures, over_time
@@ -52,6 +52,8 @@ def write_benchmark_report(
         Section("At a glance", [Text(headline(variants), lead=True), key_figures(variants)]),
         Section("Scores", [_shown_table(table, metres=not times), *notes]),
     ]
+    if (metres := metres_table(results)).rows:
+        sections.append(Section("In metres, without alignment", [metres]))
     if results["missing"]:
         rows = [[name] for name in results["missing"]]
         sections.append(Section("Not scored", [Table(("sequence",), rows)]))

@@ -108,7 +108,8 @@ def score_sequence(
 
 def _observed(sequence: BenchmarkSequence, plausibility: Plausibility) -> Iterator[BenchmarkFrame]:
     for frame in sequence.frames():
-        plausibility.push(frame.image, frame.truth, camera_matrix=frame.camera_matrix)
+        if not frame.context:
+            plausibility.push(frame.image, frame.truth, camera_matrix=frame.camera_matrix)
         yield frame
 
 
@@ -204,6 +205,7 @@ def evaluate(
         "settings": plain_settings(opened),
         "scoring": asdict(scoring),
         "quantity": method.quantity,
+        "in_metres": list(method.in_metres),
         "versions": versions(),
         "missing": missing,
         "problems": opened.report.problems,

@@ -6,7 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.evaluation.benchmarks.published import METHODS, PARTS, Published, published_rows
+from dyfn_core.evaluation.benchmarks.published import (
+    METHODS,
+    PARTS,
+    Published,
+    published_metres,
+    published_rows,
+)
 from dyfn_core.evaluation.report.html import Cell, Table
 from dyfn_core.evaluation.report.tables import write_tables
 
@@ -23,7 +29,15 @@ HEADER = (
     "coverage",
     "origin",
 )
-ALL_METRICS = ("abs_rel", "delta1", "delta2", "delta3", "rmse", "log10", "sq_rel", "rmse_log")
+ALL_METRICS = (
+    *("abs_rel", "delta1", "delta2", "delta3", "rmse", "log10", "sq_rel", "rmse_log"),
+    *("i_rmse", "mae", "i_mae"),
+)
+METRES = {"mae": 1000, "rmse": 1000, "i_mae": 1000, "i_rmse": 1000, "abs_rel": 1}  # factors
+METRES_HEADER = (
+    *("method", "MAE mm", "RMSE mm", "iMAE 1/km", "iRMSE 1/km", "AbsRel"),
+    *("scored frames", "origin"),
+)
 
 
 def result_table(results: dict[str, Any], ablations: bool = False) -> Table:
@@ -72,6 +86,32 @@ def _published(method: str, numbers: dict[str, Published]) -> list[Cell]:
     return [method, *scores, *rest, f"published ({notes})" if notes else "published"]
 
 
+def metres_table(results: dict[str, Any]) -> Table:
+    """Errors without alignment of what is in metres, means over all scored frames, and published
+    ones; no rows where there are none.
+
+    results: of evaluate().
+    """
+    rows: list[list[Cell]] = []
+    for name in results["in_metres"]:
+        scored = [
+            (found["scored_frames"], found["metric"])
+            for found in (sequence["variants"][name] for sequence in results["sequences"])
+            if found["metric"] is not None
+        ]
+        frames = sum(count for count, _ in scored)
+        means: list[Cell] = [
+            factor * sum(count * metrics[key] for count, metrics in scored) / frames
+            if frames
+            else None
+            for key, factor in METRES.items()
+        ]
+        rows.append([name, *means, frames, "measured"])
+    for row in published_metres(results["benchmark"]):
+        rows.append([row.method, *(getattr(row, key) for key in METRES), None, "published"])
+    return Table(METRES_HEADER, rows)
+
+
 def sequence_table(results: dict[str, Any]) -> Table:
     """A row per sequence, protocol and variant with every metric."""
     header = ("sequence", "method", "protocol", "frames", *ALL_METRICS, "scale", "shift")
@@ -96,12 +136,15 @@ def sequence_table(results: dict[str, Any]) -> Table:
 
 
 def write_results(results: dict[str, Any], folder: Path, title: str, ablations: bool) -> Table:
-    """results.json, table.{md,csv,tex} and sequences.{md,csv,tex}; returns the table."""
+    """results.json, table.{md,csv,tex}, sequences.{md,csv,tex} and, with rows, metres.{md,csv,tex};
+    returns the first table."""
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "results.json", results)
     table = result_table(results, ablations)
     write_tables(folder, "table", table, title)
     write_tables(folder, "sequences", sequence_table(results), f"{title}, by sequence")
+    if (metres := metres_table(results)).rows:
+        write_tables(folder, "metres", metres, f"{title}, without alignment")
     return table
 
 

@@ -122,6 +122,8 @@ def _both(base: float, value: float) -> str:
 
 
 def _percent(base: float, value: float) -> str:
+    if base == 0:
+        return f"{value:.2g}"
     change = abs(value / base - 1) * 100
     return f"{change:.0f} %" if change < 200 else f"{value / base:.1f} times"
 

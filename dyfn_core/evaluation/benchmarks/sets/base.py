@@ -20,13 +20,18 @@ class BenchmarkFrame:
     image: H x W x 3 uint8 RGB. truth: h x w float32 metres along the optical axis, of the same
     field of view; NaN, infinite or <= 0 where it is unknown. camera_matrix: 3 x 3 float64 in
     pixels of the image; None when unknown. pose: 4 x 4 float64 camera to world in metres, optical
-    axes; None when unknown.
+    axes; None when unknown. stamp: seconds; None when unknown. sparse: h x w float32 metres of
+    points that come with the frame, over the truth, NaN elsewhere; None without. context: the
+    frame is run but not scored; its truth is NaN all over.
     """
 
     image: np.ndarray
     truth: np.ndarray
     camera_matrix: np.ndarray | None = None
     pose: np.ndarray | None = None
+    stamp: float | None = None
+    sparse: np.ndarray | None = None
+    context: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,7 +142,11 @@ def cropped(frame: BenchmarkFrame, crop: tuple[int, int], name: str) -> Benchmar
         matrix = matrix.copy()
         matrix[:2, 2] -= (columns, rows)
     return replace(
-        frame, image=frame.image[inside], truth=frame.truth[inside], camera_matrix=matrix
+        frame,
+        image=frame.image[inside],
+        truth=frame.truth[inside],
+        camera_matrix=matrix,
+        sparse=None if frame.sparse is None else frame.sparse[inside],
     )
 
 
@@ -146,7 +155,8 @@ def from_rgbd(frame: RgbdFrame) -> BenchmarkFrame:
     fx, fy, cx, cy = frame.intrinsics.astype(np.float64)
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     size = (frame.image.shape[0], frame.image.shape[1])
-    return BenchmarkFrame(frame.image, frame.depth, pixel_intrinsics(matrix, size), frame.pose)
+    camera = pixel_intrinsics(matrix, size)
+    return BenchmarkFrame(frame.image, frame.depth, camera, frame.pose, frame.stamp)
 
 
 def one_by_one(
