@@ -65,6 +65,7 @@ class GroundTruth:
         if self._transform is not None and (calibration is None or view.matrix is None):
             raise MessageError("a transform needs the intrinsics of the image and of the depth")
         if calibration is None or view.matrix is None:
+            self._check_registered(message, info, frame_id)
             return undistort_depth(depth, view)
         if self._transform is None and _same_camera(calibration, depth, view):
             return undistort_depth(depth, view)
@@ -103,6 +104,13 @@ class GroundTruth:
         except MessageError as error:
             self._warn(f"its CameraInfo {error}; taken as registered to the image")
             return None
+
+    def _check_registered(self, message: Any, info: Any, frame_id: str) -> None:
+        """Frames that are numbers, as the RealSense SDK counts them, say nothing."""
+        own, images = (name.lstrip("/") for name in (str(message.header.frame_id), frame_id))
+        if own and images and own != images and not (own.isdigit() and images.isdigit()):
+            lacking = "the image has no usable intrinsics" if info else "it has no CameraInfo"
+            self._warn(f"frame {own!r} taken as registered to the image ({images!r}): {lacking}")
 
     def _check_place(self, message: Any, frame_id: str, assumed: str) -> None:
         own = str(message.header.frame_id)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from dyfn_core.data.rgbd.layouts import EXPECTED
+from dyfn_core.data.rgbd.names import visible_files
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.pictures import exif_focal, pictures, pictures_in
 from dyfn_ros.recordings.rgbd_folder import PLAIN_RATE, as_recorded
@@ -14,6 +18,8 @@ from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.storage.open import is_recording
 from dyfn_ros.recordings.topics import Topics
 from dyfn_ros.recordings.video_file import expected_frames, is_video_name, video_frames
+
+_OF_DEPTH = re.compile(r"(?:^|[^a-z])(?:depth|disp|disparity)(?:[^a-z]|$)")
 
 
 def is_image_recording(path: Path) -> bool:
@@ -35,12 +41,19 @@ class ImageRecording:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.topics = Topics("frames" if path.is_file() else "pictures", None, None)
-        self.notes = Notes()
+        self._pictures, of_depth = ([], []) if path.is_file() else _without_depth(path)
+        self._warnings: Counter[str] = Counter()
+        if of_depth:
+            self._warnings[
+                f"{len(of_depth)} files of depth by their names ({of_depth[0]}, ...): not read in "
+                f"this folder of pictures; with depth is {EXPECTED}"
+            ] = 1
+        self.notes = Notes(warnings=self._warnings.copy())
 
     @property
     def expected_frames(self) -> int:
         """See Recording; an estimate for some videos."""
-        return expected_frames(self.path) if self.path.is_file() else len(pictures_in(self.path))
+        return expected_frames(self.path) if self.path.is_file() else len(self._pictures)
 
     def doubts(self) -> list[str]:
         """See Recording."""
@@ -48,15 +61,26 @@ class ImageRecording:
 
     def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
-        self.notes = notes = Notes()
+        self.notes = notes = Notes(warnings=self._warnings.copy())
         lose: Callable[[str], None] = lambda reason: notes.losses.update([reason])  # noqa: E731
-        made = _pictures(self.path, lose) if self.path.is_dir() else video_frames(self.path, lose)
+        made = _pictures(self._pictures, lose)
+        if self.path.is_file():
+            made = video_frames(self.path, lose)
         for index, frame in enumerate(made):
             yield as_recorded(index, frame)
 
 
-def _pictures(folder: Path, lose: Callable[[str], None]) -> Iterator[FrameToRecord]:
-    paths = pictures_in(folder)
+def _without_depth(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Pictures, and what is depth of them by its name, where that is not all there is."""
+    found = pictures_in(folder)
+    pictures = [path for path in found if not _OF_DEPTH.search(path.name.lower())]
+    if not pictures:
+        return found, []
+    held = visible_files(folder)
+    return pictures, [path for path in held if _OF_DEPTH.search(path.name.lower())]
+
+
+def _pictures(paths: list[Path], lose: Callable[[str], None]) -> Iterator[FrameToRecord]:
     places = {path: number for number, path in enumerate(paths)}
     for path, image in pictures(paths, lose):
         size = (image.shape[0], image.shape[1])

@@ -14,6 +14,7 @@ from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import FolderCamera
 from dyfn_core.data.rgbd.folder import FrameFiles, RgbdFolder
 from dyfn_core.data.rgbd.layouts import PLAIN, FolderOptions, layout_of, open_folder
+from dyfn_core.data.rgbd.names import entry
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, in_nanoseconds
@@ -152,7 +153,7 @@ class RgbdRecording:
         self.path = path
         self._warnings: Counter[str] = Counter()
         self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]), options)
-        has_depth = bool(self._folder.with_depth) or (path / "depth").is_dir()
+        has_depth = bool(self._folder.with_depth) or entry(path, "depth").is_dir()
         self.topics = Topics("rgb/", "K.txt", "depth/" if has_depth else None)
         self.notes = Notes(warnings=self._warnings.copy())
 
@@ -163,14 +164,16 @@ class RgbdRecording:
 
     def doubts(self) -> list[str]:
         """See Recording; files have no time of recording."""
-        return []
+        return [*self._folder.doubts]
 
     def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
         self.notes = Notes(warnings=self._warnings.copy())
+        alike: dict[str, str] = {}  # what is wrong, without the file -> the first that says it
 
         def lose(reason: str) -> None:
-            self.notes.losses[reason] += 1
+            _, separator, what = reason.partition(": ")
+            self.notes.losses[alike.setdefault(what, reason) if separator else reason] += 1
 
         for index, frame in enumerate(rgbd_frames(self._folder, lose)):
             yield as_recorded(index, frame)

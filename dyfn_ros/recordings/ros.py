@@ -95,6 +95,8 @@ class BagRecording:
             return []
         tolerance = self._tolerance_ns * 1e-9
         images = self._image_times
+        if still := self._standing_stamps():
+            return [still]
         apart = 2 * self._matched < len(images)
         found = clock_offset(images, self._depth_times, self._tolerance_ns, apart)
         if found is not None and found.drifts:
@@ -113,6 +115,19 @@ class BagRecording:
             nearest = float(np.median(self._offsets)) * 1e-9
             return [self._doubted_offset(nearest, "the images nearest to them")]
         return []
+
+    def _standing_stamps(self) -> str:
+        """Says that one of the topics has one stamp in all of its messages."""
+        both = {self.topics.image: self._image_times, self.topics.depth: self._depth_times}
+        still = [n for n, times in both.items() if len(times) > 2 and np.ptp(times.stamps) == 0]
+        if len(still) != 1:
+            return ""
+        (name,) = still
+        stamp = int(both[name].stamps[0]) * 1e-9
+        return (
+            f"{name}: all of its {len(both[name])} messages have the stamp {stamp:g} s; --stamps "
+            "log takes the time of recording"
+        )
 
     def _doubted_offset(self, seconds: float, what: str) -> str:
         tolerance = self._tolerance_ns * 1e-9

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from itertools import islice
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,18 @@ _OF_DEPTH = re.compile(r"depth|disparity")
 _COLOUR_SPACE = re.compile(r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/")
 _REGISTERED = re.compile(r"aligned|registered")
 _OTHER_LIGHT = re.compile(
-    r"infra|thermal|lwir|lepton|amplitude|intensity|confidence|(?:^|[/_])ir_?\d*(?:[/_]|$)"
+    r"infra|thermal|lwir|lepton|boson|flir|optris|temperature|amplitude|intensity|confidence"
+    r"|(?:^|[/_])n?ir_?\d*(?:[/_]|$)"
 )
+_SAYS_DEPTH = re.compile(r"depth|range|distance|(?:^|[/_])(?:tof|z)\d*(?:[/_]|$)")
+WIDE_GREY = {"mono16", *DEPTH_ENCODINGS}  # what shows no colours
+# Parts of names that say what an image is, not whose.
+_WHAT = re.compile(
+    r"(?:rgb|colou?r|bgr|depth|disparity|image|raw|rect(?:ified)?|registered|aligned|to|points?"
+    r"|camera|cam|compressed|compressedDepth|data|stream|ground|truth|gt|[_\d])+"
+)
+DISPARITY = "disparity"
+DISPARITY_IMAGE = "stereo_msgs/msg/DisparityImage"
 
 
 @dataclass(frozen=True)
@@ -41,12 +52,29 @@ class Topics:
     """image: colour, raw or compressed. camera_info, depth, depth_info: None to do without.
 
     depth: images or clouds; depth_info: the CameraInfo of depth images that have their own.
+    remarks: what was chosen by a name or an encoding alone, and what else there is.
     """
 
     image: str
     camera_info: str | None
     depth: str | None
     depth_info: str | None = None
+    remarks: tuple[str, ...] = field(default=(), compare=False)
+
+
+@dataclass
+class _Found:
+    """What the image topics hold, by their first messages.
+
+    colours, depths: candidates, each in one transport. encodings: of raw images. unread: of the
+    topics that are of depth by their names, those that are not read as depth by themselves, with
+    what they hold.
+    """
+
+    colours: list[str]
+    depths: list[str]
+    encodings: dict[str, str]
+    unread: dict[str, str]
 
 
 def choose_topics(
@@ -62,24 +90,30 @@ def choose_topics(
     An image counts as depth when its encoding is 16UC1 or 32FC1 (mono16 when its name says
     depth) and its name does not say infrared, thermal or the like. A topic recorded both raw and
     compressed is one candidate: the one with more messages, of equals the raw one. Infrared
-    images count when there are no others. Of several CameraInfos, the sibling of the image topic
-    is taken; of several depths, the one in the image's namespace. A PointCloud2 is depth when it
-    is named. Raises RecordingError: a named topic that is absent or of another type, no image
-    topic, several candidates.
+    images, and of the others those of 16 bits of grey, count when there are no others. Of several
+    CameraInfos, the sibling of the image topic is taken; of several depths, see _nearest. A
+    PointCloud2 is depth when it is named, and so is disparity. Raises RecordingError: a named topic
+    that is absent or of another type, no image topic, several candidates.
     """
     kinds = _kinds(storage)
-    colours, depths = _classify(storage, kinds)
-    visible = [name for name in colours if not _OTHER_LIGHT.search(name.lower())] or colours
-    chosen = _named(path, kinds, image, set(PICTURES)) or _only(path, kinds, visible, "image")
+    found = _classify(storage, kinds)
+    visible = [n for n in found.colours if not _OTHER_LIGHT.search(n.lower())] or found.colours
+    coloured = [n for n in visible if found.encodings.get(n) not in WIDE_GREY] or visible
+    chosen = _named(path, kinds, image, set(PICTURES)) or _only(path, kinds, coloured, "image")
     if chosen is None:
         raise _no_image(path, storage, kinds)
+    depths = [d for d in found.depths if d != chosen]
     truth = _optional(
         path,
         kinds,
         depth,
         {IMAGE, COMPRESSED_IMAGE, POINT_CLOUD},
-        _nearest([d for d in depths if d != chosen], chosen),
+        _nearest(depths, chosen),
     )
+    remarks = [] if depth is not None else [*_depth_remarks(found, depths, chosen, truth)]
+    if image is None and len(coloured) < len(visible):
+        wide = ", ".join(f"{n} ({found.encodings[n]})" for n in visible if n not in coloured)
+        remarks.append(f"not used: {wide}; 16 bits of grey are depth when --depth-topic says so")
     info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
     images_own = truth is not None and kinds[truth] != POINT_CLOUD
     own = [name for name in _siblings(kinds, truth or "") if images_own and name != info]
@@ -88,12 +122,42 @@ def choose_topics(
         camera_info=info,
         depth=truth,
         depth_info=_optional(path, kinds, depth_info, {CAMERA_INFO}, own),
+        remarks=tuple(remarks),
     )
+
+
+def _depth_remarks(
+    found: _Found, depths: list[str], image: str, truth: str | None
+) -> Iterator[str]:
+    """What a user should know about the depth topic that was found, or that was not."""
+    if truth is None:
+        for name, held in sorted(found.unread.items()):
+            yield (
+                f"{name} is of depth by its name, and is not used: it holds {held}; expected "
+                "16UC1, 32FC1, mono16, a 16-bit PNG or compressedDepth"
+            )
+        return
+    others = ", ".join(name for name in depths if name != truth)
+    if others:
+        yield f"{truth} is taken for the depth, for its name; there are also {others}"
+    if not _SAYS_DEPTH.search(truth.lower()):
+        encoding = found.encodings.get(truth, "16 bits of grey")
+        yield (
+            f"{truth} is taken for depth by its encoding {encoding}, its name does not say so; "
+            "--depth-topic none does without"
+        )
+    ours, theirs = _whose(image), _whose(truth)
+    if ours and theirs and ours[0] != theirs[0]:
+        yield (
+            f"{truth} is the only depth, in another namespace than {image}: of another camera? "
+            "--depth-topic none does without"
+        )
 
 
 def topic_remarks(storage: Storage, topics: Topics) -> list[str]:
     """What is recorded, or should be, and is not used although that might be expected."""
-    return [*_fuller_twins(storage, [topics.image, topics.depth]), *_empty(storage)]
+    twins = _fuller_twins(storage, [topics.image, topics.depth])
+    return [*topics.remarks, *twins, *_empty(storage)]
 
 
 def _kinds(storage: Storage) -> dict[str, str]:
@@ -152,7 +216,7 @@ def choose_reference(path: Path, storage: Storage, name: str | None, kind: str) 
         RecordingError: The topic is absent or of another type, or there are several.
     """
     kinds = _kinds(storage)
-    depths = _classify(storage, kinds)[1] if name is None and kind == IMAGE else [*kinds]
+    depths = _classify(storage, kinds).depths if name is None and kind == IMAGE else [*kinds]
     candidates = sorted(topic for topic in depths if kinds[topic] == kind)
     found = _named(path, kinds, name, {kind}) or _only(path, kinds, candidates, "reference")
     if found is None:
@@ -174,7 +238,7 @@ def image_topics(path: Path, storage: Storage) -> list[str]:
     Raises RecordingError when there is none.
     """
     kinds = _kinds(storage)
-    colours, _ = _classify(storage, kinds)
+    colours = _classify(storage, kinds).colours
     if not colours:
         raise _no_image(path, storage, kinds)
     return colours
@@ -220,22 +284,30 @@ def _listing(kinds: dict[str, str], names: list[str] | dict[str, str]) -> str:
     return ", ".join(f"{name} ({kinds[name]})" for name in sorted(names)) or "no messages"
 
 
-def _classify(storage: Storage, kinds: dict[str, str]) -> tuple[list[str], list[str]]:
+def _classify(storage: Storage, kinds: dict[str, str]) -> _Found:
     """Colour and depth candidates, by the first message of each image topic."""
-    colours: list[str] = []
-    depths: list[str] = []
+    found = _Found([], [], {}, {})
     for name, kind in sorted(kinds.items()):
-        if kind not in PICTURES:
-            continue
-        message = _first(storage, name)
+        if kind == DISPARITY_IMAGE:
+            found.unread[name] = kind
+        message = _first(storage, name) if kind in PICTURES else None
         if message is None:
             continue
+        held = str(message.encoding if kind == IMAGE else getattr(message, "format", kind))
+        if kind == IMAGE:
+            found.encodings[name] = held
         if _is_depth(name, kind, message):
-            if not _OTHER_LIGHT.search(name.lower()):
-                depths.append(name)
-        elif not _pictures_depth(name):
-            colours.append(name)
-    return _one_of_twins(storage, colours), _one_of_twins(storage, depths)
+            if DISPARITY in name.lower():
+                found.unread[name] = f"{held}, by its name disparity"
+            elif not _OTHER_LIGHT.search(name.lower()):
+                found.depths.append(name)
+        elif _pictures_depth(name):
+            found.unread[name] = f"{kind} {held!r}"
+        else:
+            found.colours.append(name)
+    found.colours = _one_of_twins(storage, found.colours)
+    found.depths = _one_of_twins(storage, found.depths)
+    return found
 
 
 def _is_depth(name: str, kind: str, message: Any) -> bool:
@@ -268,12 +340,26 @@ def _first(storage: Storage, name: str) -> Any:
 
 
 def _nearest(depths: list[str], image: str) -> list[str]:
-    """The depths in the namespace of the image when that is one, else those that are registered
-    by their name when that is one, else all."""
+    """Of the depths that share most namespaces with the image: the one in the image's own, else the
+    one that is registered by its name, else all."""
+    parts = image.split("/")[:-1]
+    shared = {name: _shared(parts, name.split("/")[:-1]) for name in depths}
+    depths = [name for name in depths if shared[name] == max(shared.values())]
     space = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/"
     near = [name for name in depths if name.startswith(space)]
     registered = [name for name in depths if _REGISTERED.search(name.lower())]
     return next((found for found in (near, registered) if len(found) == 1), depths)
+
+
+def _shared(one: list[str], other: list[str]) -> int:
+    """How many parts two names have in common from the start."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
+
+
+def _whose(name: str) -> list[str]:
+    """The namespaces of a topic that do not say what it holds."""
+    parts = TRANSPORTS.sub("", name).strip("/").split("/")[:-1]
+    return [part for part in parts if not _WHAT.fullmatch(part.lower())]
 
 
 def _one_of_twins(storage: Storage, names: list[str]) -> list[str]:

@@ -19,9 +19,19 @@ TF = "tf2_msgs/msg/TFMessage"
 FLOAT = "std_msgs/msg/Float64"
 COMPRESSED_VIDEO = "foxglove_msgs/msg/CompressedVideo"
 FFMPEG_PACKET = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+FOXGLOVE_RAW = "foxglove_msgs/msg/RawImage"
+FOXGLOVE_COMPRESSED = "foxglove_msgs/msg/CompressedImage"
+FOXGLOVE_CALIBRATION = "foxglove_msgs/msg/CameraCalibration"
 _OTHERS = {  # fields of messages that are not of ROS itself
     COMPRESSED_VIDEO: "builtin_interfaces/Time timestamp, string frame_id, uint8[] data, "
     "string format",
+    FOXGLOVE_RAW: "builtin_interfaces/Time timestamp, string frame_id, uint32 width, "
+    "uint32 height, string encoding, uint32 step, uint8[] data",
+    FOXGLOVE_COMPRESSED: "builtin_interfaces/Time timestamp, string frame_id, uint8[] data, "
+    "string format",
+    FOXGLOVE_CALIBRATION: "builtin_interfaces/Time timestamp, string frame_id, uint32 width, "
+    "uint32 height, string distortion_model, float64[] d, float64[9] k, float64[9] r, "
+    "float64[12] p",
     FFMPEG_PACKET: "std_msgs/Header header, int32 width, int32 height, string encoding, "
     "uint64 pts, uint8 flags, bool is_bigendian, uint8[] data",
 }

@@ -17,13 +17,14 @@ from dyfn_ros.recordings.typestore import Lens
 VIDEO_SUFFIXES = (
     *(".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".ts", ".mts"),
     *(".wmv", ".flv", ".gif"),
+    *(".h264", ".264", ".h265", ".265", ".hevc"),  # streams without a container, and times
 )
 SHORT = 2.0  # seconds that a file may end before its announced length
 Warn = Callable[[str], None]
 
 
 def is_video_name(path: Path) -> bool:
-    """Whether a file's name is that of a video in a usual container."""
+    """Whether a file's name is that of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
@@ -88,7 +89,7 @@ def video_frames(
     if late and len(late) == decoded - 1:
         raise RecordingError(
             f"{path}: holds no times of its {decoded} frames (a raw H.264 or H.265 stream has "
-            "none); give --rate, or put it into a container such as .mp4"
+            "none); put it into a container such as .mp4, or give dyfn-record --rate"
         )
     if late:
         warn(f"{path}: {len(late)} frames whose time does not rise are left out ({late[0]})")

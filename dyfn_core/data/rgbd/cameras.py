@@ -68,6 +68,55 @@ class FolderCamera:
         return fx, fy, cx, cy
 
 
+@dataclass(frozen=True)
+class SensorInfo:
+    """What the info.txt beside frames that were exported from a .sens file says.
+
+    Attributes:
+        camera: of the colour images.
+        unit: stored depth values per metre.
+    """
+
+    camera: FolderCamera
+    unit: float
+
+    @classmethod
+    def read(cls, path: Path) -> SensorInfo | None:
+        """Lines `m_name = value`.
+
+        Returns:
+            None of a file that says something else.
+
+        Raises:
+            DataError: it cannot be read, or a value is not what was expected.
+        """
+        try:
+            lines = (line.split("=", 1) for line in path.read_text("utf-8-sig").splitlines())
+            held = {pair[0].strip(): pair[1].split() for pair in lines if len(pair) == 2}
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"{path}: cannot be read: {error}") from error
+
+        if not any(key.startswith("m_") for key in held):
+            return None
+
+        def numbers(key: str, count: int) -> list[float]:
+            try:
+                found = [float(word) for word in held[key]]
+            except (KeyError, ValueError):
+                found = []
+            if len(found) != count:
+                raise DataError(f"{path}: expected {key} = {count} numbers, got {held.get(key)}")
+            return found
+
+        matrix = np.array(numbers("m_calibrationColorIntrinsic", 16)).reshape(4, 4)[:3, :3]
+        (width,), (height,) = numbers("m_colorWidth", 1), numbers("m_colorHeight", 1)
+        (unit,) = numbers("m_depthShift", 1)
+        if not (unit > 0 and width >= 1 and height >= 1):
+            raise DataError(f"{path}: expected sizes and m_depthShift above 0")
+        size = (int(height), int(width))
+        return cls(FolderCamera(_checked(matrix, path), str(path), size), unit)
+
+
 def published_camera(folder: Path) -> FolderCamera | None:
     """Of a TUM or Bonn sequence, by its path; None when the path names none."""
     named = str(folder.resolve()).lower()

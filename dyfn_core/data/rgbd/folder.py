@@ -61,6 +61,7 @@ class RgbdFolder:
         invalid: stored values that mean no depth, besides 0.
         depth_camera: intrinsics of the depth files, which are then laid over the images. With
             intrinsics that were given, or are in the folder, depth is taken to lie there already.
+        doubts: what makes the pairs of images and depth implausible.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class RgbdFolder:
     unit: float
     invalid: tuple[int, ...] = ()
     depth_camera: FolderCamera | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def with_depth(self) -> list[FrameFiles]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.data.files import numbered_files, subfolders
+from dyfn_core.data.files import hidden, numbered_files, subfolders
 from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import (
     PUBLISHED_SIZE,
@@ -17,17 +18,28 @@ from dyfn_core.data.rgbd.cameras import (
     SEVEN_SCENES_DEPTH,
     Camera,
     FolderCamera,
+    SensorInfo,
     published_camera,
+    read_camera,
 )
 from dyfn_core.data.rgbd.folder import Calibration, FrameFiles, RgbdFolder
 from dyfn_core.data.rgbd.lists import (
+    Stamped,
     associated_files,
-    nearest,
     read_poses,
     stamped_files,
     trajectory,
 )
-from dyfn_core.data.rgbd.names import FIRST_TIME, frame_numbers, paired, visible_files
+from dyfn_core.data.rgbd.names import (
+    FIRST_TIME,
+    TOLERANCE,
+    entry,
+    frame_numbers,
+    nearest,
+    paired,
+    times_in,
+    visible_files,
+)
 
 LAYOUTS = TUM, ASSOCIATIONS, SEVEN_SCENES, SCANNET, PLAIN = (
     "tum",
@@ -41,10 +53,21 @@ EXPECTED = (
     ".pose.txt (7-Scenes); color/, depth/, pose/, intrinsic/ (ScanNet export); rgb/, depth/, K.txt"
 )
 ASSOCIATION_FILES = ("associations.txt", "associate.txt", "association.txt", "assoc.txt")
+# Any other text file beside rgb/ whose first line names a colour and a depth file.
+_NAMED = r"[\d.]+\s+\S*(?:rgb|colou?r|depth)\S*"
+_ASSOCIATION = re.compile(rf"{_NAMED}\s+{_NAMED}")
+COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")  # all but the first: beside depth/
+CAMERA_FILES = (
+    "K.txt",
+    "intrinsics.txt",
+    "camera-intrinsics.txt",
+    "camera_intrinsics.txt",
+    "calibration.txt",
+)
+SENSOR_INFO = ("info.txt", "_info.txt")  # of frames exported from a .sens file
 COLOUR_SUFFIXES, DEPTH_SUFFIXES = (".jpg", ".jpeg", ".png"), (".png",)
 TEXT_SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".db", ".ini")
 MILLIMETRES, TUM_UNIT = 1000.0, 5000.0  # stored depth values per metre
-TOLERANCE = 0.02  # seconds between a colour frame and its depth or pose
 GROUND_TRUTH = "groundtruth.txt"
 Poses = Mapping[Path, np.ndarray]  # by colour file
 
@@ -75,17 +98,39 @@ def layout_of(folder: Path) -> str | None:
     """One of LAYOUTS; None for a folder of another kind."""
     if not folder.is_dir():
         return None
-    if (folder / "rgb.txt").is_file():
+    if entry(folder, "rgb.txt").is_file():
         return TUM
     if _association_file(folder) is not None:
         return ASSOCIATIONS
     if next(folder.glob("frame-*.color.*"), None) is not None:
         return SEVEN_SCENES
-    if (folder / "color").is_dir() and (
-        (folder / "depth").is_dir() or (folder / "intrinsic").is_dir()
-    ):
+    colour, depth = _colour_folder(folder), entry(folder, "depth")
+    if colour.name.lower() == "color" and entry(folder, "intrinsic").is_dir():
         return SCANNET
-    return PLAIN if (folder / "rgb").is_dir() else None
+    if not colour.is_dir():
+        return None
+    return PLAIN if depth.is_dir() or colour.name.lower() == COLOUR_FOLDERS[0] else None
+
+
+def _colour_folder(folder: Path) -> Path:
+    return entry(folder, *COLOUR_FOLDERS)
+
+
+def _camera_file(folder: Path, report: DataReport) -> Path:
+    """K.txt, or another usual file of intrinsics if it can be read as such."""
+    usual = entry(folder, CAMERA_FILES[0])
+    if usual.exists():
+        return usual
+    for name in CAMERA_FILES[1:]:
+        other = entry(folder, name)
+        if other.exists():
+            try:
+                read_camera(other)
+            except DataError as error:
+                report.miss(f"file that may hold intrinsics and is not used: {error}", other)
+            else:
+                return other
+    return usual
 
 
 def find_folders(root: Path, levels: int) -> Iterator[Path]:
@@ -131,30 +176,38 @@ def open_folder(path: Path, report: DataReport, options: FolderOptions | None = 
 
 
 def _plain(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
-    images = _files(folder / "rgb", COLOUR_SUFFIXES, report)
+    images = _files(_colour_folder(folder), COLOUR_SUFFIXES, report)
     poses: Poses = {}
-    table = folder / "poses.txt"
+    table = entry(folder, "poses.txt")
     if table.exists():
         rows = read_poses(table, report)
         if len(rows) != len(images):
             raise DataError(f"{table}: {len(rows)} poses for {len(images)} images")
         poses = {image: row for image, row in zip(images, rows, strict=True) if _finite(row)}
     frames = _in_folders(folder, images, poses, report)
-    calibration = options.calibration(folder / "K.txt")
+    by_time = times_in([frame.image for frame in frames if frame.depth is not None])
+    if by_time and options.depth_scale is None and any(time % 1 for time in by_time):
+        report.miss(
+            "files named by times, as TUM RGB-D's are, whose depth has 5000 values a metre; "
+            f"read as {MILLIMETRES:g} a metre (--depth-scale)",
+            folder,
+        )
+    calibration = options.calibration(_camera_file(folder, report))
     return RgbdFolder(folder, PLAIN, frames, calibration, options.depth_scale or MILLIMETRES)
 
 
 def _scannet(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
-    images = _files(folder / "color", COLOUR_SUFFIXES, report)
-    texts = [path for path in visible_files(folder / "pose") if path.suffix == ".txt"]
+    images = _files(_colour_folder(folder), COLOUR_SUFFIXES, report)
+    texts = [path for path in visible_files(entry(folder, "pose")) if path.suffix == ".txt"]
     frames = _in_folders(folder, images, _pose_files(paired(images, texts), report), report)
-    calibration = options.calibration(folder / "intrinsic" / "intrinsic_color.txt")
+    own = entry(entry(folder, "intrinsic"), "intrinsic_color.txt", "intrinsics_color.txt")
+    calibration = options.calibration(own if own.exists() else _camera_file(folder, report))
     return RgbdFolder(folder, SCANNET, frames, calibration, options.depth_scale or MILLIMETRES)
 
 
 def _seven_scenes(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
-    images = numbered_files(folder, r"frame-(\d+)\.color\.(?:png|jpg)")
-    depths = numbered_files(folder, r"frame-(\d+)\.depth\.png")
+    images = numbered_files(folder, r"frame-(\d+)\.color\.(?i:png|jpe?g)")
+    depths = numbered_files(folder, r"frame-(\d+)\.depth\.(?i:png|pgm)")
     texts = numbered_files(folder, r"frame-(\d+)\.pose\.txt")
     poses = _pose_files({images[n]: texts[n] for n in images if n in texts}, report)
     pairs = {images[n]: depths[n] for n in images if n in depths}
@@ -163,27 +216,50 @@ def _seven_scenes(folder: Path, report: DataReport, options: FolderOptions) -> R
         FrameFiles(number, image, pairs.get(image), poses.get(image))
         for number, image in images.items()
     )
+    info = entry(folder, *SENSOR_INFO)
+    sensor = SensorInfo.read(info) if info.exists() else None
+    if sensor is not None:
+        calibration = options.calibration(_camera_file(folder, report), sensor.camera)
+        unit = options.depth_scale or sensor.unit
+        return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,))
     source = "published intrinsics of 7-Scenes"
     published = FolderCamera(SEVEN_SCENES_CAMERA, source, PUBLISHED_SIZE)
-    calibration = options.calibration(folder / "K.txt", published)
+    calibration = options.calibration(_camera_file(folder, report), published)
     unit = options.depth_scale or MILLIMETRES
     depth_camera = FolderCamera(SEVEN_SCENES_DEPTH, source, PUBLISHED_SIZE)
     return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,), depth_camera)
 
 
 def _tum(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
-    colours = stamped_files(folder / "rgb.txt", report)
-    has_depth = (folder / "depth.txt").exists() or (folder / "depth").exists()
-    depths = stamped_files(folder / "depth.txt", report) if has_depth else []
+    colours = stamped_files(entry(folder, "rgb.txt"), report)
+    table = entry(folder, "depth.txt")
+    has_depth = table.exists() or entry(folder, "depth").exists()
+    depths = stamped_files(table, report) if has_depth else []
     files = []
     for number, (stamp, image) in enumerate(colours):
         depth = nearest(depths, stamp + options.depth_offset, options.tolerance)
         if depth is None and has_depth:
             report.miss(f"image without depth within {options.tolerance} s", image)
         files.append(FrameFiles(number, image, depth, stamp=stamp))
-    if not (folder / GROUND_TRUTH).exists():
+    if not entry(folder, GROUND_TRUTH).exists():
         report.miss(f"folder without {GROUND_TRUTH} (its frames have no poses)", folder)
-    return _listed(folder, TUM, files, report, options)
+    opened = _listed(folder, TUM, files, report, options)
+    if opened.with_depth or not depths:
+        return opened
+    return replace(opened, doubts=(_far(table, colours, depths, options),))
+
+
+def _far(
+    table: Path, colours: Sequence[Stamped], depths: Sequence[Stamped], options: FolderOptions
+) -> str:
+    """Says how far the stamps of depth are from the images', none of which is near one."""
+    seconds = float(np.median([s for s, _ in depths]) - np.median([s for s, _ in colours]))
+    side = "after" if seconds > 0 else "before"
+    return (
+        f"{table}: its stamps are {abs(seconds):.6g} s {side} those of the images (medians, "
+        f"tolerance {options.tolerance:g}); if they are of another clock, --depth-offset "
+        f"{seconds:.6g} takes that away"
+    )
 
 
 def _associations(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:
@@ -215,10 +291,13 @@ def _listed(
     options: FolderOptions,
 ) -> RgbdFolder:
     """A folder whose files are in lists: poses by stamp, TUM's unit and calibrations."""
-    if (folder / GROUND_TRUTH).exists():
-        poses = trajectory(folder / GROUND_TRUTH, report)
+    truth = entry(folder, GROUND_TRUTH)
+    if truth.exists():
+        poses = trajectory(truth, report)
         files = [_placed(frame, poses, options.tolerance) for frame in files]
-    calibration = options.calibration(folder / "K.txt", published_camera(folder))
+    for path in folder.glob("*.freiburg"):
+        report.miss(f"trajectory that is not read (expected {GROUND_TRUTH})", path)
+    calibration = options.calibration(_camera_file(folder, report), published_camera(folder))
     unit = options.depth_scale or TUM_UNIT
     return RgbdFolder(folder, layout, tuple(files), calibration, unit)
 
@@ -232,8 +311,22 @@ def _placed(
 
 
 def _association_file(folder: Path) -> Path | None:
-    found = (folder / name for name in ASSOCIATION_FILES)
-    return next((path for path in found if path.is_file()), None)
+    usual = entry(folder, *ASSOCIATION_FILES)
+    if usual.is_file():
+        return usual
+    if not (_colour_folder(folder).is_dir() or entry(folder, "depth").is_dir()):
+        return None
+    return next((path for path in sorted(folder.glob("*.txt")) if _associates(path)), None)
+
+
+def _associates(path: Path) -> bool:
+    """Whether a text file associates colour and depth files, whatever its name."""
+    if hidden(path) or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        lines = file.read(4096).decode("utf-8-sig", "replace").splitlines()
+    first = next((line.strip() for line in lines if line.strip() and line[:1] != "#"), "")
+    return bool(_ASSOCIATION.match(first.lower()))
 
 
 def _files(folder: Path, suffixes: tuple[str, ...], report: DataReport) -> list[Path]:
@@ -254,10 +347,15 @@ def _in_folders(
     folder: Path, images: list[Path], poses: Poses, report: DataReport
 ) -> tuple[FrameFiles, ...]:
     """The frames of these colour files, with depth/*.png that belong to them by name."""
-    depths = _files(folder / "depth", DEPTH_SUFFIXES, report)
+    place = entry(folder, "depth")
+    depths = _files(place, DEPTH_SUFFIXES, report)
     pairs = paired(images, depths)
-    if (folder / "depth").is_dir():
+    if place.is_dir():
         _count_lone(images, depths, pairs, report)
+    else:
+        for other in subfolders(folder):
+            if "depth" in other.name.lower():
+                report.miss("folder of depth by its name that is not read (depth/ is)", other)
     return tuple(
         FrameFiles(number, image, pairs.get(image), poses.get(image))
         for number, image in zip(frame_numbers(images), images, strict=True)

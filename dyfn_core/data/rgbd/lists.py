@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
-import bisect
 import re
+from decimal import Decimal
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from dyfn_core.data.files import numbers, read_table, usable_poses
 from dyfn_core.data.frames import DataError, DataReport, FrameError
+from dyfn_core.data.rgbd.names import in_seconds
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
-Thing = TypeVar("Thing")
 Stamped = tuple[float, Path]
 
 
 def stamped_files(path: Path, report: DataReport) -> list[Stamped]:
-    """Lines `stamp file`, sorted by stamp; files that are not there are counted."""
+    """Lines `stamp file`, sorted by stamp; files that are not there are counted.
+
+    A comma may stand between them; stamps may be of ns, as in_seconds has it.
+    """
     entries = []
     for line in _lines(path):
-        match = re.fullmatch(r"([\d.eE+-]+)\s+(\S.*)", line)
+        match = re.fullmatch(r"([\d.eE+-]+)(?:\s*,\s*|\s+)(\S.*)", line)
         if not match:
             raise DataError(f"{path}: expected lines of `stamp file`, got {line!r}")
-        entries.append((_number(match.group(1), path, line), path.parent / match.group(2)))
+        entries.append((_stamp(match.group(1), path, line), _file(path, match.group(2))))
     return [entry for entry in sorted(entries) if _is_there(entry[1], path, report)]
 
 
@@ -35,7 +37,7 @@ def associated_files(path: Path, report: DataReport) -> list[tuple[float, Path, 
         The colour's stamp, the colour file and the depth file of each line, sorted; lines whose
         files are not there are counted.
     """
-    rows = [line.split() for line in _lines(path)]
+    rows = [re.split(r"\s*,\s*|\s+", line) for line in _lines(path)]
     for row in rows:
         if len(row) < 4:
             raise DataError(
@@ -47,10 +49,10 @@ def associated_files(path: Path, report: DataReport) -> list[tuple[float, Path, 
     colour, depth = (2, 0) if rows and depth_first[0][0] else (0, 2)
     entries = []
     for row in rows:
-        image, other = path.parent / row[colour + 1], path.parent / row[depth + 1]
+        image, other = _file(path, row[colour + 1]), _file(path, row[depth + 1])
         there = [_is_there(file, path, report) for file in (image, other)]
         if all(there):
-            entries.append((_number(row[colour], path, " ".join(row)), image, other))
+            entries.append((_stamp(row[colour], path, " ".join(row)), image, other))
     return sorted(entries)
 
 
@@ -64,7 +66,9 @@ def read_poses(path: Path, report: DataReport) -> np.ndarray:
     table = numbers(path, expected)
     lines, columns = table.shape
     if columns == 4:
-        whole = lines % 4 == 0 and bool((table[3::4] == [0, 0, 0, 1]).all())
+        last = table[3::4]
+        none = ~np.isfinite(last).any(1, keepdims=True)  # a matrix that is no pose
+        whole = lines % 4 == 0 and bool(((last == [0, 0, 0, 1]) | none).all())
         height = 4 if whole else 3
         if lines % height == 0:
             table = table.reshape(-1, height * 4)
@@ -91,15 +95,7 @@ def trajectory(path: Path, report: DataReport) -> list[tuple[float, np.ndarray]]
     """Lines `stamp tx ty tz qx qy qz qw`: 4 x 4 camera to world, sorted by stamp."""
     rows = usable_poses(read_table(path, 8), path, report, slice(4, 8))
     rows = rows[np.isfinite(rows).all(1)]
-    return [(row[0], _posed(np.array(row[1:]))) for row in sorted(rows.tolist())]
-
-
-def nearest(entries: list[tuple[float, Thing]], stamp: float, tolerance: float) -> Thing | None:
-    """The entry nearest to the stamp; None when it is farther than the tolerance."""
-    place = bisect.bisect_left(entries, stamp, key=lambda entry: entry[0])
-    beside = entries[max(0, place - 1) : place + 1]
-    best = min(beside, key=lambda entry: abs(entry[0] - stamp), default=None)
-    return None if best is None or abs(best[0] - stamp) > tolerance else best[1]
+    return [(in_seconds(row[0]), _posed(np.array(row[1:]))) for row in sorted(rows.tolist())]
 
 
 def _lines(path: Path) -> list[str]:
@@ -110,11 +106,17 @@ def _lines(path: Path) -> list[str]:
     return [line for line in lines if line and not line.startswith("#")]
 
 
-def _number(text: str, path: Path, line: str) -> float:
+def _stamp(text: str, path: Path, line: str) -> float:
     try:
-        return float(text)
-    except ValueError as error:
+        return in_seconds(Decimal(text))
+    except (ArithmeticError, ValueError) as error:
         raise DataError(f"{path}: expected a stamp in seconds in {line!r}") from error
+
+
+def _file(path: Path, name: str) -> Path:
+    """A file that a list names, also with the separators of another system."""
+    file = path.parent / name
+    return file if file.exists() else path.parent / name.replace("\\", "/")
 
 
 def _is_there(file: Path, path: Path, report: DataReport) -> bool:

@@ -7,7 +7,7 @@ import sqlite3
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -48,12 +48,16 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 class Recorded(NamedTuple):
-    """One message: log_ns is when it was recorded, data is its CDR bytes."""
+    """One message: log_ns is when it was recorded, data is its CDR bytes.
+
+    to_cdr: what makes them of the bytes of a file, inside a storage; raises one of DAMAGE.
+    """
 
     topic: str
     kind: str
     log_ns: int
     data: bytes
+    to_cdr: Callable[[bytes], bytes] | None = None
 
     def message(self) -> Any:
         """The deserialised message. Raises RecordingError when the bytes are not its type."""
@@ -94,6 +98,7 @@ class Losses:
     def __init__(self) -> None:
         self._sentences: list[str] = []
         self._more = 0
+        self._others: Counter[tuple[str, str, str]] = Counter()
 
     def add(self, sentence: str) -> None:
         """One more."""
@@ -102,10 +107,19 @@ class Losses:
         else:
             self._more += 1
 
+    def beside(self, topic: str, kind: str, others: str) -> None:
+        """A message of another type than the others of its topic."""
+        self._others[topic, kind, others] += 1
+
     @property
     def sentences(self) -> list[str]:
         """All of them."""
-        return [*self._sentences, *([f"and {self._more} more"] if self._more else [])]
+        mixed = [
+            f"{topic}: {count} messages of {kind} are left out, since the topic's first is of "
+            f"{others}"
+            for (topic, kind, others), count in self._others.items()
+        ]
+        return [*self._sentences, *mixed, *([f"and {self._more} more"] if self._more else [])]
 
 
 def ros_type(name: str) -> str:

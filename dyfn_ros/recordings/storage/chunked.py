@@ -76,6 +76,10 @@ class ChunkedFile(ABC):
         for recorded in found:
             if recorded.topic not in topics:
                 continue
+            kind = self.topics[recorded.topic].kind
+            if recorded.kind != kind:
+                self._lost.beside(recorded.topic, recorded.kind, kind)
+                continue
             try:
                 whole = self._finish(recorded)
             except DAMAGE as error:
@@ -119,7 +123,9 @@ class ChunkedFile(ABC):
 
     def _finish(self, recorded: Recorded) -> Recorded:
         """A message that is wanted, in the form that all storages give."""
-        return recorded
+        if recorded.to_cdr is None:
+            return recorded
+        return recorded._replace(data=recorded.to_cdr(recorded.data), to_cdr=None)
 
     @abstractmethod
     def _read_index(self) -> Index | None:

@@ -35,7 +35,7 @@ from dyfn_ros.recordings.storage.base import (
     reason,
 )
 from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
-from dyfn_ros.recordings.storage.mcap_forms import Form, message_form
+from dyfn_ros.recordings.storage.forms import Form, message_form
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -61,7 +61,7 @@ class McapFile(ChunkedFile):
     _expected: int | None = None  # messages, as the summary says
     _schemas: dict[int, Schema]
     _channels: dict[int, Channel]
-    _forms: dict[str, Form]  # of topics
+    _forms: dict[int, Form]  # of channels
     _chunked: bool
 
     def _read_index(self) -> Index | None:
@@ -79,10 +79,10 @@ class McapFile(ChunkedFile):
             return None
         topics: dict[str, Topic] = {}
         for key, channel in channels.items():
-            form, count = self._form(channel), statistics[0].channel_message_counts
-            if form is not None:
-                known = topics.get(channel.topic, Topic(form.kind, 0))
-                topics[channel.topic] = Topic(known.kind, known.count + count.get(key, 0))
+            form, counts = self._form(channel), statistics[0].channel_message_counts
+            known = topics.get(channel.topic, Topic(form.kind, 0))
+            count = counts.get(key, 0) if known.kind == form.kind else 0
+            topics[channel.topic] = Topic(known.kind, known.count + count)
         spans = self._spans(chunks)
         if spans is None:
             return None
@@ -142,28 +142,26 @@ class McapFile(ChunkedFile):
                 message = Message.read(ReadDataStream(BytesIO(content)), len(content))
                 channel = self._channels[message.channel_id]
                 form = self._form(channel)
-                if form is not None:
-                    yield Recorded(channel.topic, form.kind, message.log_time, message.data)
+                log_ns, data = message.log_time, message.data
+                yield Recorded(channel.topic, form.kind, log_ns, data, form.to_cdr)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 record: Any = parse(opcode, content)
                 if opcode == Opcode.SCHEMA:
                     self._schemas[record.id] = record
                 else:
+                    if self._channels.get(record.id, record) != record:
+                        self._forms.pop(record.id, None)
                     self._channels[record.id] = record
 
-    def _form(self, channel: Channel) -> Form | None:
-        """How its messages are read; None beside another encoding of the topic, which counts."""
-        form = self._forms.get(channel.topic)
+    def _form(self, channel: Channel) -> Form:
+        """How its messages are read."""
+        form = self._forms.get(channel.id)
         if form is None:
             schema = self._schemas.get(channel.schema_id)
             form = message_form(channel.message_encoding, schema)
             if schema is not None:
-                self._forms[channel.topic] = form
-        return form if form.encoding == channel.message_encoding else None
-
-    def _finish(self, recorded: Recorded) -> Recorded:
-        form = self._forms.get(recorded.topic)
-        return recorded if form is None else recorded._replace(data=form.to_cdr(recorded.data))
+                self._forms[channel.id] = form
+        return form
 
     def _scan(self) -> Iterator[Recorded]:
         self._lost = Losses()

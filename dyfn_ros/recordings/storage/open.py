@@ -35,6 +35,7 @@ EXPECTED = (
     "a rosbag2 folder, an .mcap, .db3 or .bag file (also .zstd of one), an RGB-D folder, a video "
     "file or a folder of pictures"
 )
+_NAMED = 8  # parts that a loss names
 _FREE = 1 << 30  # bytes that unpacking leaves on the disk
 
 
@@ -143,6 +144,11 @@ def _open_folder(path: Path) -> Storage:
     if contents.renamed and not losses and found == contents.messages:
         remarks = [f"{f}: metadata.yaml names it otherwise" for f in contents.renamed]
         return ChainedStorage([*parts.values()], (), remarks)
+    whole = not (losses or contents.missing or contents.renamed or contents.unlisted)
+    if whole and contents.messages is not None and found < contents.messages:
+        losses.append(
+            f"{path}: metadata.yaml counts {contents.messages} messages, {found} are there"
+        )
     listed = {file: part for file, part in parts.items() if file not in contents.renamed}
     unlisted = [*contents.unlisted, *(contents.renamed if listed else [])]
     remarks = [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
@@ -170,12 +176,12 @@ def _contents(path: Path) -> _Contents:
     """What there is, by metadata.yaml when that can be read."""
     unlisted = _files(path)
     if not (path / "metadata.yaml").exists():
-        return _Contents(unlisted)
+        return _Contents(unlisted, _missing_numbers(path, unlisted))
     try:
         names, messages = _listed(path / "metadata.yaml")
     except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
         problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
-        return _Contents(unlisted, problem=problem)
+        return _Contents(unlisted, _missing_numbers(path, unlisted), problem=problem)
     places = {name: _place(path, name) for name in names}
     found = [*dict.fromkeys(place for place in places.values() if place is not None)]
     unlisted = [f for f in unlisted if _plain_name(f) not in {_plain_name(p) for p in found}]
@@ -191,6 +197,26 @@ def _contents(path: Path) -> _Contents:
     if not found:
         return _Contents(unlisted, missing, messages=messages)
     return _Contents(found, missing, unlisted=unlisted, messages=messages)
+
+
+def _missing_numbers(folder: Path, files: list[Path]) -> list[str]:
+    """Sentences about the parts NAME_0, NAME_1, ... that are not there between others.
+
+    The first is number 0 where NAME is the folder's, as rosbag2 names parts.
+    """
+    parts = [re.fullmatch(r"(.+)_(\d+)", _plain_name(file).split(".")[0]) for file in files]
+    names = {part.group(1) if part else None for part in parts}
+    if len(names) != 1 or None in names:
+        return []
+    (name,) = names
+    numbers = sorted({int(part.group(2)) for part in parts if part})
+    first = 0 if name == folder.name else numbers[0]
+    missing = sorted({*range(first, numbers[-1])} - {*numbers})
+    if not missing:
+        return []
+    listed = ", ".join(f"{name}_{number}" for number in missing[:_NAMED])
+    more = ", ..." if missing[_NAMED:] else ""
+    return [f"{folder}: {listed}{more} missing, by the names of the other parts"]
 
 
 def _listed(metadata: Path) -> tuple[list[str], int | None]:

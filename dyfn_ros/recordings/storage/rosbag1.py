@@ -25,7 +25,7 @@ from dyfn_ros.recordings.storage.base import (
     reason,
 )
 from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
-from dyfn_ros.recordings.typestore import TYPES
+from dyfn_ros.recordings.storage.forms import Form, ros1_form
 
 MAGIC = b"#ROSBAG V2.0\n"
 MAX_HEADER = 1 << 20  # a connection's header holds its message definition
@@ -37,7 +37,7 @@ class Bag1File(ChunkedFile):
     """See ChunkedFile. Messages have their ROS 2 type and CDR bytes; seq of headers is dropped."""
 
     def _read_index(self) -> Index | None:
-        self._connections: dict[int, tuple[str, str]] = {}
+        self._connections: dict[int, tuple[str, Form]] = {}
         with self.path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
                 return None
@@ -65,9 +65,10 @@ class Bag1File(ChunkedFile):
 
     def _topics(self, counts: Counter[int]) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
-        for key, (topic, kind) in self._connections.items():
-            known = topics.get(topic, Topic(kind, 0))
-            topics[topic] = Topic(known.kind, known.count + counts[key])
+        for key, (topic, form) in self._connections.items():
+            known = topics.get(topic, Topic(form.kind, 0))
+            count = counts[key] if known.kind == form.kind else 0
+            topics[topic] = Topic(known.kind, known.count + count)
         return topics
 
     def _record(self, file: BinaryIO) -> tuple[Header, bytes]:
@@ -92,7 +93,7 @@ class Bag1File(ChunkedFile):
         inner = read_header(BytesIO(struct.pack("<I", len(data)) + data), MAX_HEADER)
         topic = normalize(header.get_string("topic"))
         kind = normalize_msgtype(inner.get_string("type"))
-        self._connections[header.get_uint32("conn")] = (topic, kind)
+        self._connections[header.get_uint32("conn")] = (topic, ros1_form(kind))
 
     def _messages(self, data: bytes) -> Iterator[Recorded]:
         """Messages of a chunk's data; connections are remembered. Raises one of DAMAGE."""
@@ -105,11 +106,8 @@ class Bag1File(ChunkedFile):
             if op == RecordType.CONNECTION:
                 self._connect(header, content)
             elif op == RecordType.MSGDATA:
-                topic, kind = self._connections[header.get_uint32("conn")]
-                yield Recorded(topic, kind, header.get_time("time"), content)
-
-    def _finish(self, recorded: Recorded) -> Recorded:
-        return recorded._replace(data=bytes(TYPES.ros1_to_cdr(recorded.data, recorded.kind)))
+                topic, form = self._connections[header.get_uint32("conn")]
+                yield Recorded(topic, form.kind, header.get_time("time"), content, form.to_cdr)
 
     def _scan(self) -> Iterator[Recorded]:
         self._lost = Losses()

@@ -14,10 +14,9 @@ from dyfn_ros.recordings.storage.base import (
     Recorded,
     Topic,
     count_topics,
-    plain,
     reason,
-    ros_type,
 )
+from dyfn_ros.recordings.storage.forms import Form, ros2_form
 
 _LAST = (1 << 63) - 1
 
@@ -54,8 +53,13 @@ class SqliteFile:
                 yield from self._finished(recorded)
 
     def _finished(self, recorded: Recorded) -> Iterator[Recorded]:
+        kind = self.topics[recorded.topic].kind
+        if recorded.kind != kind:
+            self._lost.beside(recorded.topic, recorded.kind, kind)
+            return
+        assert recorded.to_cdr is not None
         try:
-            found = recorded._replace(data=plain(recorded.data))
+            found = recorded._replace(data=recorded.to_cdr(recorded.data), to_cdr=None)
         except DAMAGE as error:
             self._lost.add(f"{self.path}: a message of {recorded.topic}: {reason(error)}")
             return
@@ -70,9 +74,10 @@ class SqliteFile:
         if not set(counts) <= set(topics):
             raise LookupError("messages of unknown topics")
         found: dict[str, Topic] = {}
-        for key, (name, kind) in topics.items():
-            known = found.get(name, Topic(kind, 0))
-            found[name] = Topic(known.kind, known.count + int(counts.get(key, 0)))
+        for key, (name, form) in topics.items():
+            known = found.get(name, Topic(form.kind, 0))
+            count = int(counts.get(key, 0)) if known.kind == form.kind else 0
+            found[name] = Topic(known.kind, known.count + count)
         return found
 
     def _open(self) -> sqlite3.Connection:
@@ -134,17 +139,20 @@ class SqliteFile:
             self._lost.add(f"{self.path}: {count} messages read, then: {reason(error)}")
 
 
-def _topics(database: sqlite3.Connection) -> dict[int, tuple[str, str]]:
+_Known = dict[int, tuple[str, Form]]  # topics by their keys
+
+
+def _topics(database: sqlite3.Connection) -> _Known:
     found = {}
     for key, name, kind in database.execute("SELECT id, name, type FROM topics"):
         if not (isinstance(name, str) and isinstance(kind, str)):
             raise TypeError(f"topic {key} has no name or type")
-        found[int(key)] = (name, ros_type(kind))
+        found[int(key)] = (name, ros2_form(kind))
     return found
 
 
 def _rows(
-    database: sqlite3.Connection, known: dict[int, tuple[str, str]], start: int
+    database: sqlite3.Connection, known: _Known, start: int
 ) -> Iterator[tuple[int, Recorded]]:
     query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id"
     previous = start - 1
@@ -155,15 +163,14 @@ def _rows(
         yield previous, _recorded(known, *row[1:])
 
 
-def _recorded(known: dict[int, tuple[str, str]], topic: Any, stamp: Any, data: Any) -> Recorded:
+def _recorded(known: _Known, topic: Any, stamp: Any, data: Any) -> Recorded:
     if not (isinstance(stamp, int) and isinstance(data, bytes)):
         raise TypeError("a row that is no message")
-    return Recorded(*known[topic], stamp, data)
+    name, form = known[topic]
+    return Recorded(name, form.kind, stamp, data, form.to_cdr)
 
 
-def _behind(
-    database: sqlite3.Connection, known: dict[int, tuple[str, str]], bad: int
-) -> int | None:
+def _behind(database: sqlite3.Connection, known: _Known, bad: int) -> int | None:
     """The first row behind a bad one from which on rows can be read; None when there is none."""
 
     def readable(start: int) -> bool:

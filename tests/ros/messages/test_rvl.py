@@ -18,39 +18,9 @@ from dyfn_ros.recordings.typestore import (
 )
 from dyfn_ros.recordings.writer import RecordingWriter
 from tests.support.numbered import SECOND, depth, numbers, picture
+from tests.support.rvl import encode_rvl
 
 LAYOUT = "16UC1; compressedDepth rvl"
-
-
-def encode(image: np.ndarray) -> bytes:
-    """H x W uint16 -> size and code."""
-    nibbles: list[int] = []
-
-    def put(number: int) -> None:
-        while True:
-            low, number = number & 7, number >> 3
-            nibbles.append(low | (8 if number else 0))
-            if not number:
-                return
-
-    pixels, place, previous = image.reshape(-1).tolist(), 0, 0
-    while place < len(pixels):
-        start = place
-        while place < len(pixels) and pixels[place] == 0:
-            place += 1
-        put(place - start)
-        start = place
-        while place < len(pixels) and pixels[place]:
-            place += 1
-        put(place - start)
-        for value in pixels[start:place]:
-            difference = value - previous
-            put(2 * difference if difference >= 0 else -2 * difference - 1)
-            previous = value
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [nibbles[start : start + 8] for start in range(0, len(nibbles), 8)]
-    code = [sum(n << (28 - 4 * k) for k, n in enumerate(word)) for word in words]
-    return struct.pack(f"<II{len(code)}I", image.shape[1], image.shape[0], *code)
 
 
 def images() -> dict[str, np.ndarray]:
@@ -69,7 +39,7 @@ def images() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", [*images()])
 def test_every_image_comes_back(name: str) -> None:
     image = images()[name]
-    np.testing.assert_array_equal(decode_rvl(encode(image)), image)
+    np.testing.assert_array_equal(decode_rvl(encode_rvl(image)), image)
 
 
 def test_a_code_written_out_by_hand() -> None:
@@ -82,7 +52,7 @@ def test_inverse_depth_is_read() -> None:
     a, b = 100.0 * 101, 100.0
     metres = np.array([[1.0, 2.0, 8.0]])
     values = np.append(np.round(a / metres + b), 0).astype(np.uint16)[None]
-    data = struct.pack("<iff", 0, a, b) + encode(values)
+    data = struct.pack("<iff", 0, a, b) + encode_rvl(values)
     message = compressed_message(np.frombuffer(data, np.uint8), "32FC1; compressedDepth rvl", 0, "")
     assert is_compressed_depth(message)
     decoded = decode_compressed_depth(message)
@@ -94,7 +64,7 @@ def test_a_recording_with_rvl_depth_is_scored_with_its_depth(tmp_path: Path) -> 
     with RecordingWriter(tmp_path / "bag") as writer:
         for index in range(4):
             stamp = SECOND + index * SECOND // 10
-            data = bytes(12) + encode(depth_to_millimetres(depth(index)))
+            data = bytes(12) + encode_rvl(depth_to_millimetres(depth(index)))
             packed = compressed_message(np.frombuffer(data, np.uint8), LAYOUT, stamp, "camera")
             writer.write("/depth/image_raw/compressedDepth", COMPRESSED_IMAGE, packed, stamp)
             writer.write_image("/image", picture(index), stamp, "camera")
@@ -108,7 +78,7 @@ def test_a_recording_with_rvl_depth_is_scored_with_its_depth(tmp_path: Path) -> 
     [
         (b"\0" * 7, "ends early: 7 bytes"),
         (struct.pack("<II", 1 << 16, 1 << 16), "says that it is 65536 x 65536 pixels"),
-        (encode(images()["noise"])[:-40], "ends early|damaged"),
+        (encode_rvl(images()["noise"])[:-40], "ends early|damaged"),
         (struct.pack("<IIII", 9, 9, 0x11111111, 0x11111111), "ends early|damaged"),
         (struct.pack("<III", 2, 1, 0), "damaged at pixel 0 of 2"),
         (struct.pack("<III", 2, 1, 0x01F00000), "ends early|damaged"),
@@ -126,7 +96,7 @@ def test_damage_is_named(data: bytes, said: str) -> None:
 
 def test_cut_and_changed_codes_never_raise_anything_else() -> None:
     random = np.random.default_rng(1)
-    code = encode(images()["holes"])
+    code = encode_rvl(images()["holes"])
     for _ in range(300):
         changed = np.frombuffer(code, np.uint8)[: random.integers(8, len(code) + 1)].copy()
         changed[random.integers(8, len(changed) + 1) - 1 :][:1] = random.integers(0, 256)
@@ -139,7 +109,7 @@ def test_cut_and_changed_codes_never_raise_anything_else() -> None:
 def test_an_image_of_a_sensor_is_fast() -> None:
     image = np.tile(depth_to_millimetres(depth(1)), (20, 20))
     image[::7, ::3] = 0
-    data = encode(image)
+    data = encode_rvl(image)
     start = time.process_time()
     np.testing.assert_array_equal(decode_rvl(data), image)
     assert time.process_time() - start < 2

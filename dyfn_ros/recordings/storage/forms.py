@@ -1,4 +1,4 @@
-"""Messages of an MCAP file in whatever encoding -> the CDR bytes of their ROS 2 type."""
+"""Messages in whatever encoding -> the CDR bytes of the ROS 2 type that they are read as."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from dyfn_ros.recordings.typestore import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     COMPRESSED_VIDEO,
+    FOXGLOVE_CALIBRATION,
+    FOXGLOVE_COMPRESSED,
+    FOXGLOVE_RAW,
     IMAGE,
     TYPES,
     calibration_message,
@@ -31,19 +34,23 @@ FOXGLOVE = {
     "foxglove.RawImage": IMAGE,
     "foxglove.CameraCalibration": CAMERA_INFO,
 }
+# The same as ROS messages, but for video, which is read as it is.
+FOXGLOVE_ROS = {
+    FOXGLOVE_RAW: IMAGE,
+    FOXGLOVE_COMPRESSED: COMPRESSED_IMAGE,
+    FOXGLOVE_CALIBRATION: CAMERA_INFO,
+}
 EXTRA = "`pip install 'dyfn_ros[foxglove]'`"
 
 
 @dataclass(frozen=True)
 class Form:
-    """What the messages of a topic are.
+    """What messages are.
 
-    encoding: as the channel names it. kind: ROS 2 type; of an encoding that is not read, a text
-    that is no type and says so. to_cdr: a message's bytes -> those of the ROS 2 type; raises one
-    of DAMAGE.
+    kind: ROS 2 type; of an encoding that is not read, a text that is no type and says so.
+    to_cdr: a message's bytes -> those of the ROS 2 type; raises one of DAMAGE.
     """
 
-    encoding: str
     kind: str
     to_cdr: Callable[[bytes], bytes]
 
@@ -52,24 +59,55 @@ def message_form(encoding: str, schema: Schema | None) -> Form:
     """cdr and ros1 of any type, json and protobuf of Foxglove's images, video and calibration."""
     name = "" if schema is None else schema.name
     if encoding == "cdr":
-        return Form(encoding, ros_type(name), plain)
+        return ros2_form(name)
     if encoding == "ros1":
-        kind = ros_type(name)
-        return Form(encoding, kind, lambda data: bytes(TYPES.ros1_to_cdr(data, kind)))
+        return ros1_form(name)
     why = "which is not read"
     if schema is not None and name in FOXGLOVE:
         kind = FOXGLOVE[name]
         if encoding == "json":
-            return Form(encoding, kind, lambda data: _cdr(kind, _from_json(data)))
+            return Form(kind, lambda data: _cdr(kind, _from_json(data)))
         if encoding == "protobuf":
             try:
                 decode = _protobuf(schema)
-                return Form(encoding, kind, lambda data: _cdr(kind, decode(data)))
+                return Form(kind, lambda data: _cdr(kind, decode(data)))
             except ImportError:
                 why = f"which needs {EXTRA}"
             except DAMAGE as error:
                 why = f"whose schema cannot be used ({reason(error)})"
-    return Form(encoding, f"{name}, encoded as {encoding}, {why}", lambda data: data)
+    return Form(f"{name}, encoded as {encoding}, {why}", lambda data: data)
+
+
+def ros2_form(name: str) -> Form:
+    """Messages in CDR, whatever the style of the type's name; each may be packed by zstd."""
+    kind = ros_type(name)
+    if kind not in FOXGLOVE_ROS:
+        return Form(kind, plain)
+    return Form(FOXGLOVE_ROS[kind], lambda data: _from_foxglove(kind, plain(data)))
+
+
+def ros1_form(name: str) -> Form:
+    """Messages as ROS 1 serialises them."""
+    kind = ros_type(name)
+    if kind not in FOXGLOVE_ROS:
+        return Form(kind, lambda data: bytes(TYPES.ros1_to_cdr(data, kind)))
+    return Form(
+        FOXGLOVE_ROS[kind],
+        lambda data: _from_foxglove(kind, bytes(TYPES.ros1_to_cdr(data, kind))),
+    )
+
+
+def _from_foxglove(kind: str, data: bytes) -> bytes:
+    message: Any = TYPES.deserialize_cdr(data, kind)
+    fields = {
+        name.upper() if len(name) == 1 else name: getattr(message, name)
+        for name in message.__dataclass_fields__
+        if not name.startswith("_")
+    }
+    stamp = message.timestamp
+    return _cdr(
+        FOXGLOVE_ROS[kind], {**fields, "stamp_ns": stamp.sec * 1_000_000_000 + stamp.nanosec}
+    )
 
 
 def _from_json(data: bytes) -> Mapping[str, Any]:
