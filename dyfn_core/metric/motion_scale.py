@@ -56,7 +56,8 @@ class MotionScaleOptions:
         doubt_seconds: time constant of the share of contradicted frames.
         doubt: share of recent frames in which the odometry contradicts the pictures beyond which
             no metres are given. With the defaults an odometry has to agree for 3.5 s first.
-        shape_doubt: the same share beyond which neither field nor remembered points are used.
+        shape_doubt: the same share beyond which the depth is the prediction's own, and no
+            remembered points are used. Between the two, scale and field fade.
     """
 
     motion: MotionOptions = field(default_factory=MotionOptions)
@@ -142,7 +143,8 @@ class MotionScale:
     from the seconds before still count.
 
     Attributes:
-        log_scale: of the frame in the locked unit; 0 before and at the first measurement.
+        log_scale: of the frame in the locked unit; 0 before and at the first measurement, and
+            while the odometry contradicts most pictures.
         field: H x W float32, to be added to log_scale.
         metric: metres in the locked unit; None before the first measurement, and while the
             odometry has agreed with too few of the recent pictures.
@@ -210,9 +212,10 @@ def step(
     if scale is None or unit is None:
         nothing = np.zeros(frame.depth.shape, np.float32)
         return state, MotionScale(0.0, nothing, None, math.nan, points, None, points.problem)
+    share = _believed(state, options)
     found = MotionScale(
-        log_scale=scale.log_scale - unit,
-        field=_field(state, points, ratios - scale.log_scale, frame, options),
+        log_scale=share * (scale.log_scale - unit),
+        field=np.float32(share) * _field(state, points, ratios - scale.log_scale, frame, options),
         metric=math.exp(unit) if state.contradicted <= options.doubt else None,
         sigma=scale.sigma,
         points=points,
@@ -263,6 +266,17 @@ def _doubted(
     return replace(state, contradicted=share)
 
 
+def _believed(state: MotionScaleState, options: MotionScaleOptions) -> float:
+    """Share of scale and field that is applied: 1 where metres may be given, 0 beyond shape_doubt.
+
+    It follows the share of contradicted frames, so the output does not jump.
+    """
+    if state.contradicted <= options.doubt:
+        return 1.0
+    room = options.shape_doubt - options.doubt
+    return max(options.shape_doubt - state.contradicted, 0.0) / room if room > 0 else 0.0
+
+
 def _doubt_problem(state: MotionScaleState, options: MotionScaleOptions) -> str:
     if state.contradicted <= options.doubt:
         return ""
@@ -308,8 +322,7 @@ def _field(
     """H x W float32; 0 where the field is switched off, not to be trusted or without points."""
     good = np.isfinite(residuals) & (points.sigma < options.field_sigma)
     good &= points.sigma_pixels < options.field_sigma_pixels
-    doubted = state.contradicted > options.shape_doubt
-    if options.field is None or doubted or good.sum() < options.motion.fewest:
+    if options.field is None or not _believed(state, options) or good.sum() < options.motion.fewest:
         return np.zeros(frame.depth.shape, np.float32)
     sigma, depth = points.sigma[good], np.where(frame.valid, frame.depth, np.nan)
     noise, misfit = np.hypot(_DOUBT * sigma, _SHAPE), np.hypot(sigma, _SHAPE)

@@ -179,6 +179,25 @@ def test_no_metres_from_an_odometry_that_contradicts_the_pictures(
     assert np.isfinite(found[-1].relative(wrong[-1].depth)).all()
 
 
+def test_depth_is_the_prediction_s_own_while_the_odometry_contradicts_most_pictures(
+    walked: list[MotionFrame],
+) -> None:
+    """Bit for bit, and on the way there scale and field fade."""
+    state, found = run(walked)
+    assert found[-1].metric is not None
+    there = [*walked, *walked[::-1]]
+    aside = [pose_at((0.0, 0.0, 0.1 * i), (0.0, 0.0, 0.0)) for i in range(len(there))]
+    shares = [1.0]
+    for i, (frame, pose) in enumerate(zip(there, aside, strict=True)):
+        wrong = replace(frame, pose=pose, stamp=walked[-1].stamp + 0.15 * (i + 1))
+        state, scale = step(state, wrong, OPTIONS)
+        assert state.scale is not None and state.unit is not None
+        shares.append(scale.log_scale / (state.scale.log_scale - state.unit))
+    assert min(shares) >= 0 and np.abs(np.diff(shares)).max() < 0.15
+    assert shares[-1] == 0.0 and shares.count(1.0) < len(there) / 2
+    assert scale.relative(wrong.depth).tobytes() == wrong.depth.tobytes()
+
+
 def test_missing_predictions_stay_missing(walked: list[MotionFrame]) -> None:
     holed = []
     for frame in walked:
