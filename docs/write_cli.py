@@ -13,6 +13,7 @@ from textwrap import fill
 
 from dyfn_core.cli import eval as dyfn_eval
 from dyfn_core.cli import train as dyfn_train
+from dyfn_ros.app import options as dyfn_app
 from dyfn_ros.demo import cli as dyfn_demo
 from dyfn_ros.depth import options as dyfn_depth
 from dyfn_ros.record import cli as dyfn_record
@@ -36,6 +37,7 @@ def parsers() -> list[argparse.ArgumentParser]:
     """The parsers of all commands but the node's, which takes ROS arguments."""
     return [
         dyfn_depth.parser(),
+        dyfn_app.parser(),
         dyfn_replay.parser(),
         dyfn_record.parser(),
         dyfn_demo.parser(),

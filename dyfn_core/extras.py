@@ -11,6 +11,7 @@ MODULES = {
     "datasets": ("OpenEXR", "h5py"),
     "video": ("av",),
     "rerun": ("rerun",),
+    "app": ("gradio",),
     "foxglove": ("mcap_protobuf",),
     "ray": ("ray",),
 }

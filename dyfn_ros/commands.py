@@ -8,6 +8,11 @@ def depth() -> int:
     return start("dyfn-depth", "dyfn_ros.depth.cli")
 
 
+def app() -> int:
+    """`dyfn-app`."""
+    return start("dyfn-app", "dyfn_ros.app.cli")
+
+
 def replay() -> int:
     """`dyfn-replay`."""
     return start("dyfn-replay", "dyfn_ros.replay.cli")

@@ -13,6 +13,8 @@ from dyfn_core import __version__
 from dyfn_core.cli import eval as dyfn_eval
 from dyfn_core.cli import train as dyfn_train
 from dyfn_core.cli.arguments import command_parser, renamed
+from dyfn_ros.app import cli as dyfn_app
+from dyfn_ros.app import options as app_options
 from dyfn_ros.demo import cli as dyfn_demo
 from dyfn_ros.depth import cli as dyfn_depth
 from dyfn_ros.depth import options as depth_options
@@ -27,6 +29,7 @@ WRITER = Path(__file__).parents[1] / "docs/write_cli.py"
 Main = Callable[[Sequence[str]], int]
 MAINS: dict[str, Main] = {
     "dyfn-depth": dyfn_depth.main,
+    "dyfn-app": dyfn_app.main,
     "dyfn-replay": dyfn_replay.main,
     "dyfn-record": dyfn_record.main,
     "dyfn-demo": dyfn_demo.main,
@@ -36,6 +39,7 @@ MAINS: dict[str, Main] = {
 }
 PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
     "dyfn-depth": depth_options.parser,
+    "dyfn-app": app_options.parser,
     "dyfn-replay": replay_options.parser,
     "dyfn-record": dyfn_record.parser,
     "dyfn-demo": dyfn_demo.parser,

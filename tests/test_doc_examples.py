@@ -18,7 +18,7 @@ import yaml
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
 from tests.support.made_videos import make_video
 from tests.support.rgbd_frames import rgbd
-from tests.test_docs import PAGES, page_id
+from tests.test_docs import PAGES, ROOT, page_id
 
 FENCE = re.compile(
     r"(?:^<!-- not run: (?P<reason>[^\n]+) -->\n)?^```(?P<language>\w*)\n(?P<code>.*?)^```$",
@@ -106,6 +106,20 @@ def test_yaml_is_yaml(page: Path) -> None:
     for one in examples(page):
         if one.language == "yaml" and one.reason is None:
             assert yaml.safe_load(one.code)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = pytest.importorskip("nbclient", reason="the extra `docs` is not installed")
+    import nbformat
+
+    monkeypatch.setenv("FRAMES", "3")
+    path = ROOT / "docs/notebooks/quickstart.ipynb"
+    notebook = nbformat.read(path, nbformat.current_nbformat)
+    resources = {"metadata": {"path": str(path.parent)}}
+    client.NotebookClient(notebook, timeout=300, resources=resources).execute()
+    said = [output.get("text", "") for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert any("3 frames; the last one is not in metres" in text for text in said)
 
 
 def test_every_example_has_a_language_that_is_run_or_a_reason() -> None:

@@ -12,22 +12,24 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.prediction import Frame
+from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.session import StreamSession
 from dyfn_core.threads import computing_threads
 from dyfn_ros.depth.camera import KnownCamera
 from dyfn_ros.depth.live import Open, open_capture
 from dyfn_ros.depth.outputs import DepthOutputs
 from dyfn_ros.depth.settings import DepthJob
-from dyfn_ros.depth.source import DepthSource, open_source
+from dyfn_ros.depth.source import DepthSource, SourceFrame, open_source
 from dyfn_ros.recordings.errors import RecordingError
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
 ModelLoader = Callable[[str, str], "GeometryModel"]  # name, device
+Watch = Callable[[SourceFrame, Prediction[np.ndarray]], None]
 
 
 class Stop:
@@ -83,7 +85,13 @@ class Outcome:
     interrupted: bool = False
 
 
-def run(job: DepthJob, loader: ModelLoader, stop: Stop, capture: Open = open_capture) -> Outcome:
+def run(
+    job: DepthJob,
+    loader: ModelLoader,
+    stop: Stop,
+    capture: Open = open_capture,
+    watch: Watch | None = None,
+) -> Outcome:
     """Read, run and write.
 
     Args:
@@ -91,6 +99,7 @@ def run(job: DepthJob, loader: ModelLoader, stop: Stop, capture: Open = open_cap
         loader: Gives the model.
         stop: Asked before every frame.
         capture: Opens cameras and addresses.
+        watch: Is shown every frame with its depth, in order.
 
     Raises:
         RecordingError: The source cannot be used.
@@ -104,7 +113,7 @@ def run(job: DepthJob, loader: ModelLoader, stop: Stop, capture: Open = open_cap
         _require_frame(source)
         session = StreamSession(loader(job.model, job.device), job.stream)
         with computing_threads(job.threads), outputs:
-            outcome = _frames(source, camera, session, outputs, stop)
+            outcome = _frames(source, camera, session, outputs, stop, watch)
             outputs.finish(_facts(job, session, camera, outcome))
     finally:
         if source.live is not None:
@@ -130,6 +139,7 @@ def _frames(
     session: StreamSession,
     outputs: DepthOutputs,
     stop: Stop,
+    watch: Watch | None,
 ) -> Outcome:
     start, frames, withheld = time.perf_counter(), 0, 0
     origins: Counter[str] = Counter()
@@ -141,7 +151,10 @@ def _frames(
             pushed = Frame(image, frame.stamp, matrix, visible)
             prediction = session.push(pushed)
             withheld += prediction.withheld is not None
-            outputs.write(replace(frame, image=image), prediction)
+            seen = replace(frame, image=image)
+            outputs.write(seen, prediction)
+            if watch is not None:
+                watch(seen, prediction)
             frames += 1
             if stop():
                 break

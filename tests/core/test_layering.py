@@ -36,6 +36,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "replay": {"recordings", "messages"},
         "record": {"recordings", "messages"},
         "depth": {"recordings", "messages", "replay"},
+        "app": {"depth", "recordings", "replay"},
         "node": {"messages"},
     },
     "dyfn_worlds": {

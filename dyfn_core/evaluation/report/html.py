@@ -93,6 +93,11 @@ class Section:
 
 def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> None:
     """Write the HTML file; it appears only when it is complete."""
+    write_text(Path(path), report_html(title, sections))
+
+
+def report_html(title: str, sections: Sequence[Section]) -> str:
+    """The whole page, which needs no other file."""
     body = "\n".join(_section(number, section) for number, section in enumerate(sections))
     links = "".join(f'<a href="#s{n}">{escape(s.title)}</a>' for n, s in enumerate(sections))
     parts = [part for section in sections for part in section.parts]
@@ -102,13 +107,12 @@ def write_report(path: str | Path, title: str, sections: Sequence[Section]) -> N
     if any(isinstance(part, CloudView) for part in parts):
         scripts.append(CLOUD_SCRIPT)
     script = "".join(f"<script>{text}</script>\n" for text in scripts)
-    page = (
+    return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(title)}</title>\n<style>{STYLE}</style></head>\n"
         f"<body>{clip}<h1>{escape(title)}</h1>\n<nav>{links}</nav>\n{body}\n{script}</body></html>\n"
     )
-    write_text(Path(path), page)
 
 
 def _section(number: int, section: Section) -> str:

@@ -1,0 +1,1 @@
+"""`dyfn-app`: a page in the browser that shows the depth of a video."""
