@@ -13,6 +13,7 @@ from torch import Tensor
 from typing_extensions import TypeVar
 
 from dyfn_core.geometry.camera import pixel_intrinsics
+from dyfn_core.quantities import AFFINE_DEPTH as AFFINE_DEPTH
 from dyfn_core.quantities import DEPTH as DEPTH
 from dyfn_core.quantities import DISPARITY as DISPARITY
 
@@ -157,7 +158,8 @@ class Prediction(Generic[ArrayT]):
         intrinsics: 3 x 3 float32, normalised: pixel x = (u + 0.5) / W, y = (v + 0.5) / H.
             `camera_matrix` has them in pixels.
         state: Goes into the next call of the same stream; None for a model without DyFN.
-        quantity: What the model predicts. "depth": depth is right up to one scale. "disparity":
+        quantity: What the model predicts. "depth": depth is right up to one scale.
+            "affine_depth": right up to scale and shift; the shift is taken for 0. "disparity":
             `disparity` is right up to scale and shift; depth is its inverse under the assumption
             that the shift is 0, so compare with truth by aligning `disparity` with 1 / z.
         disparity: H x W float32, >= 0, only for quantity "disparity".
@@ -168,6 +170,11 @@ class Prediction(Generic[ArrayT]):
         unit: depth / unit keeps one scale over the whole stream, also where metres begin or end.
         withheld: H x W bool, what `mask` leaves out only because its metres are not known; None
             when that is nothing.
+        normal: H x W x 3 float32, unit normals of the surfaces in the optical frame, as the model
+            says; 0 where the model predicts nothing. None for models without them, and in streams
+            that were not asked for them.
+        model_scale: Metres in one unit of a stream's depth by the model's own word for this frame,
+            see metric_source "model"; None where it said nothing.
     """
 
     points: ArrayT
@@ -182,6 +189,8 @@ class Prediction(Generic[ArrayT]):
     metric: bool = False
     unit: float = 1.0
     withheld: ArrayT | None = None
+    normal: ArrayT | None = None
+    model_scale: float | None = None
 
     @property
     def camera_matrix(self) -> np.ndarray:
@@ -233,6 +242,8 @@ class Prediction(Generic[ArrayT]):
             self.metric,
             self.unit,
             None if self.withheld is None else _array(self.withheld),
+            None if self.normal is None else _array(self.normal),
+            self.model_scale,
         )
 
     def scaled(self, scale: float) -> Prediction[ArrayT]:

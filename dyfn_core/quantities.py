@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 DEPTH, DISPARITY, INVERSE = "depth", "disparity", "inverse"
-QUANTITIES = (DEPTH, DISPARITY, INVERSE)
+QUANTITIES = (DEPTH, DISPARITY, INVERSE)  # of files
+AFFINE_DEPTH = "affine_depth"  # of models whose depth has an unknown scale and an unknown shift
 
 
 def scored_quantity(kind: str) -> str:
-    """How values of one of QUANTITIES are aligned: disparity as such, the others as depth.
+    """How values of a kind are aligned: disparity as such, the others as depth.
+
+    Every alignment with depth fits a scale and a shift, so AFFINE_DEPTH is scored as DEPTH.
 
     Raises:
-        ValueError: `kind` is none of them.
+        ValueError: `kind` is neither one of QUANTITIES nor AFFINE_DEPTH.
     """
-    if kind not in QUANTITIES:
+    if kind not in (*QUANTITIES, AFFINE_DEPTH):
         raise ValueError(f"quantity {kind!r} is unknown, expected one of {QUANTITIES}")
     return DISPARITY if kind == DISPARITY else DEPTH
 

@@ -17,6 +17,7 @@ from dyfn_core.models.base import GeometryModel, Latent, image_to_batch
 from dyfn_core.models.controls import decode_with, latent_controls
 from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import StreamState
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.scoring.protocols import CONTROLS
 from dyfn_core.scoring.variants import VariantScore, VariantScorers, mean_scores
 
@@ -116,7 +117,9 @@ def score_encoded(
     found: dict[str, list[VariantScore]] = {name: [] for name in (*images, *stabilizers)}
     for sequence, encoded in sequences:
         scorers = VariantScorers(
-            tuple(stabilizers), model.quantity, controls={name: name for name in images}
+            tuple(stabilizers),
+            scored_quantity(model.quantity),
+            controls={name: name for name in images},
         )
         for predictions, truth in decode(model, encoded, stabilizers):
             scorers.push(predictions, truth)
@@ -176,7 +179,7 @@ def errors_by_length(
     lengths: Sequence[int],
 ) -> dict[int, float]:
     """Video AbsRel of the first n frames, aligned again for each n that the sequence reaches."""
-    scorers, found = VariantScorers(("dyfn",), model.quantity), {}
+    scorers, found = VariantScorers(("dyfn",), scored_quantity(model.quantity)), {}
     frames = decode(model, sequence, {"dyfn": stabilizer})
     for count, (predictions, truth) in enumerate(frames, 1):
         scorers.push(predictions, truth)

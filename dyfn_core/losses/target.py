@@ -69,13 +69,26 @@ def target_from_depth(depth: Tensor, intrinsics: Tensor, aspect: float) -> Targe
         The true points of the frames.
     """
     valid = torch.isfinite(depth) & (depth > 0)
-    z = torch.where(valid, depth, 1.0)
-    height, width = depth.shape[-2:]
-    u = (torch.arange(width, device=depth.device) + 0.5) / width
-    v = (torch.arange(height, device=depth.device) + 0.5) / height
+    points = on_rays(torch.where(valid, depth, 1.0), intrinsics)
+    diagonal = (aspect**2 + 1) ** 0.5
+    focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / diagonal
+    return Target(points, valid, torch.isposinf(depth), focal)
+
+
+def on_rays(z: Tensor, intrinsics: Tensor) -> Tensor:
+    """Points of a depth.
+
+    Args:
+        z: B x H x W.
+        intrinsics: B x 4, normalised fx, fy, cx, cy.
+
+    Returns:
+        B x H x W x 3.
+    """
+    height, width = z.shape[-2:]
+    u = (torch.arange(width, device=z.device) + 0.5) / width
+    v = (torch.arange(height, device=z.device) + 0.5) / height
     fx, fy, cx, cy = (intrinsics[:, index, None, None] for index in range(4))
     x = (u[None, None, :] - cx) / fx * z
     y = (v[None, :, None] - cy) / fy * z
-    diagonal = (aspect**2 + 1) ** 0.5
-    focal = 0.5 * (intrinsics[:, 0] * aspect + intrinsics[:, 1]) / diagonal
-    return Target(torch.stack([x, y, z], dim=-1), valid, torch.isposinf(depth), focal)
+    return torch.stack([x, y, z], dim=-1)

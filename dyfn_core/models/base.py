@@ -20,6 +20,7 @@ from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DEPTH, DISPARITY, Prediction, StreamState
 
 NOMINAL_FOV = 60.0  # degrees, of an unknown camera whose model gives no point map
+RATIO_GRID = 64  # pixels of a side that two depths are compared at
 FARTHEST = 1000.0  # times the unit; disparities closer to 0 say nothing but "far"
 
 
@@ -30,11 +31,19 @@ class Latent:
     features: B x C x h x w.
     image_size: (H, W) of the caller's image, the size that points come out at.
     network_size: (H, W) of the resized image that the decoder works at.
+    summary: B x D, what the decoder knows of each image besides the features, which DyFN leaves
+        alone (MoGe v2: the class token, from which it tells metres); None for nothing.
     """
 
     features: Tensor
     image_size: tuple[int, int]
     network_size: tuple[int, int]
+    summary: Tensor | None = None
+
+    def entry(self, index: int) -> Latent:
+        """One image of the batch, as a batch of one."""
+        summary = None if self.summary is None else self.summary[index : index + 1]
+        return replace(self, features=self.features[index : index + 1], summary=summary)
 
 
 @dataclass(frozen=True)
@@ -43,10 +52,15 @@ class AffinePoints:
 
     points: B x H x W x 3, after the model's remap (exp: z > 0, x and y proportional to z).
     mask: B x H x W, raw mask output; valid where it exceeds the model's mask threshold.
+    metric_scale: B, metres in one unit by the model's word for each image, of the points of the
+        latent that DyFN has not changed; None for models that know no metres.
+    normal: B x H x W x 3, unit length; None for models without, and where not asked for.
     """
 
     points: Tensor
     mask: Tensor
+    metric_scale: Tensor | None = None
+    normal: Tensor | None = None
 
     @property
     def values(self) -> Tensor:
@@ -55,7 +69,43 @@ class AffinePoints:
 
     def entry(self, index: int) -> AffinePoints:
         """One image of the batch, as a batch of one."""
-        return AffinePoints(self.points[index : index + 1], self.mask[index : index + 1])
+        return AffinePoints(
+            self.points[index : index + 1],
+            self.mask[index : index + 1],
+            None if self.metric_scale is None else self.metric_scale[index : index + 1],
+            None if self.normal is None else self.normal[index : index + 1],
+        )
+
+
+@dataclass(frozen=True)
+class AffineDepth:
+    """Depth without a camera: true up to one scale, and one shift where the model says so.
+
+    depth: B x H x W, > 0.
+    mask: B x H x W, raw mask output; valid where it exceeds the model's mask threshold.
+    metres_of_focal: Metres in one unit for each unit of the normalised focal lengths fx and fy, of
+        the depth of a latent that DyFN has not changed; None for models that know no metres.
+    """
+
+    depth: Tensor
+    mask: Tensor
+    metres_of_focal: tuple[float, float] | None = None
+
+    @property
+    def values(self) -> Tensor:
+        """B x H x W: what an alignment compares with truth."""
+        return self.depth
+
+    def entry(self, index: int) -> AffineDepth:
+        """One image of the batch, as a batch of one."""
+        return replace(self, depth=self.depth[index : index + 1], mask=self.mask[index : index + 1])
+
+    def metric_scale(self, intrinsics: Tensor) -> Tensor | None:
+        """B: metres in one unit, for normalised intrinsics B x 3 x 3; None if unknown."""
+        if self.metres_of_focal is None:
+            return None
+        x, y = self.metres_of_focal
+        return x * intrinsics[:, 0, 0] + y * intrinsics[:, 1, 1]
 
 
 @dataclass(frozen=True)
@@ -77,13 +127,19 @@ class AffineDisparity:
         return AffineDisparity(self.disparity[index : index + 1])
 
 
+Affine = AffinePoints | AffineDepth | AffineDisparity
+
+
 class GeometryModel(nn.Module, ABC):
     """An encoder and a decoder around one latent, with DyFN in between.
 
     stabilizer: the DyFN module, or None for a plain base model. Its parameters are
         "stabilizer.*" in the state dict of every model.
     mask_threshold: a pixel is valid where the raw mask exceeds it.
-    quantity: "depth" (decode gives AffinePoints) or "disparity" (AffineDisparity).
+    quantity: "depth" (decode gives AffinePoints, or AffineDepth without a shift), "affine_depth"
+        (AffineDepth) or "disparity" (AffineDisparity).
+    has_normals: whether decode_all gives normals.
+    knows_metres: "" for no; "camera" when it needs the focal lengths for them; else "always".
     stabilizer_pool: the pooling that suits a new stabilizer on this latent.
     token_cell: pixels along the side of one token of num_tokens.
     """
@@ -92,6 +148,8 @@ class GeometryModel(nn.Module, ABC):
     quantity: str = DEPTH
     stabilizer_pool: int = 1
     token_cell: int = 14
+    has_normals: bool = False
+    knows_metres: str = ""
     # No class-level None here: it would hide the registered submodule.
     stabilizer: DyFN | None
 
@@ -123,8 +181,12 @@ class GeometryModel(nn.Module, ABC):
         """image: B x 3 x H x W float RGB in 0..1 -> Latent."""
 
     @abstractmethod
-    def decode(self, latent: Latent) -> AffinePoints | AffineDisparity:
-        """Latent -> affine-invariant points (or disparity) at latent.image_size."""
+    def decode(self, latent: Latent) -> Affine:
+        """Latent -> affine-invariant points (or depth, or disparity) at latent.image_size."""
+
+    def decode_all(self, latent: Latent) -> Affine:
+        """As decode, with the normals of models that have them."""
+        return self.decode(latent)
 
     def stabilize(
         self, features: Tensor, state: StreamState | None
@@ -153,17 +215,21 @@ class GeometryModel(nn.Module, ABC):
         state: StreamState | None = None,
         num_tokens: int | None = None,
         stabilize: bool = True,
-    ) -> tuple[AffinePoints | AffineDisparity, StreamState | None]:
+    ) -> tuple[Affine, StreamState | None]:
         """image B x 3 x H x W float RGB in 0..1 -> affine-invariant points or disparity, state.
 
         With stabilize=False nothing of the stabilizer runs and the state comes back as None.
         """
-        latent = self.encode(image, num_tokens)
-        if stabilize and self.stabilizer is not None:
-            latent, state = self.stabilize_latent(latent, state)
-        else:
-            state = None
+        latent, state = self.stabilized(self.encode(image, num_tokens), state, stabilize)
         return self.decode(latent), state
+
+    def stabilized(
+        self, latent: Latent, state: StreamState | None, stabilize: bool = True
+    ) -> tuple[Latent, StreamState | None]:
+        """As stabilize_latent; the latent itself and None for a base, or with stabilize=False."""
+        if stabilize and self.stabilizer is not None:
+            return self.stabilize_latent(latent, state)
+        return latent, None
 
     @torch.inference_mode()
     def infer(
@@ -182,27 +248,80 @@ class GeometryModel(nn.Module, ABC):
         state: the previous prediction's state of the same stream(s); None at the first frame.
         num_tokens: how finely to look; None for the model's default.
         fov_x: horizontal field of view in degrees when the camera is known (one number or B);
-            None recovers it from the point map, or takes NOMINAL_FOV where there is none
-            (quantity "disparity").
+            None recovers it from the point map, or takes NOMINAL_FOV where there is none.
         force_projection: points are the depth unprojected with the intrinsics; else the
             model's own points plus the shift.
         apply_mask: depth and points are +inf where the prediction is invalid.
         stabilize: False gives the base model's single-image output, bit for bit.
+        A model that knows metres gives metres, unless it needs fov_x for them and has none. Where
+        DyFN has changed the scale, they are those of the image's own latent, decoded as well.
         Raises TypeError or ValueError, naming what was wrong, for a bad image, fov_x or state.
         """
         batch, single = image_to_batch(image, self.device)
-        affine, state = self.predict_affine(batch, state, num_tokens, stabilize)
-        if isinstance(affine, AffineDisparity):
-            prediction = _of_disparity(affine.disparity, fov_x, state, apply_mask)
-            return first_of_batch(prediction) if single else prediction
-        valid = affine.mask > self.mask_threshold
-        height, width = valid.shape[-2:]
-        known = None if fov_x is None else focal_from_fov(fov_x, width / height, len(valid))
-        focal, shift = recover_focal_shift(affine.points, valid, known)
-        intrinsics = intrinsics_from_focal(focal, width / height).to(affine.points)
-        shift = shift.to(affine.points)
-        prediction = assemble(affine, valid, shift, intrinsics, state, force_projection, apply_mask)
+        latent = self.encode(batch, num_tokens)
+        changed, state = self.stabilized(latent, state, stabilize)
+        affine = self.decode_all(changed)
+        prediction = self._geometry(affine, fov_x, state, force_projection, apply_mask)
+        if self.knows_metres and (self.knows_metres != "camera" or fov_x is not None):
+            scale = metric_scale(affine, prediction.intrinsics)
+            if scale is not None and changed is not latent:
+                own = self._geometry(self.decode(latent), fov_x, None)
+                scale = scale * scale_ratio(own, prediction).nan_to_num(nan=1.0)
+            prediction = prediction if scale is None else _in_metres(prediction, scale)
         return first_of_batch(prediction) if single else prediction
+
+    def _geometry(
+        self,
+        affine: Affine,
+        fov_x: float | Tensor | None,
+        state: StreamState | None,
+        force_projection: bool = True,
+        apply_mask: bool = True,
+    ) -> Prediction:
+        """What the decoder says of each image by itself, up to scale, batched."""
+        height, width = affine.values.shape[-2:]
+        count, aspect = len(affine.values), width / height
+        if isinstance(affine, AffinePoints):
+            valid = affine.mask > self.mask_threshold
+            known = None if fov_x is None else focal_from_fov(fov_x, aspect, count)
+            focal, shift = recover_focal_shift(affine.points, valid, known)
+            intrinsics = intrinsics_from_focal(focal, aspect).to(affine.points)
+            shift = shift.to(affine.points)
+            return assemble(affine, valid, shift, intrinsics, state, force_projection, apply_mask)
+        focal = focal_from_fov(NOMINAL_FOV if fov_x is None else fov_x, aspect, count)
+        intrinsics = intrinsics_from_focal(focal, aspect).to(affine.values)
+        if isinstance(affine, AffineDepth):
+            return from_depth(affine, self, intrinsics, state, apply_mask)
+        unit = median_disparity(affine.disparity)
+        return from_disparity(affine.disparity, unit, intrinsics, state, apply_mask)
+
+
+def metric_scale(affine: Affine, intrinsics: Tensor) -> Tensor | None:
+    """B: metres in one unit of the latent's own geometry, by the model; None if it knows none.
+
+    intrinsics: B x 3 x 3, normalised, of the true camera.
+    """
+    if isinstance(affine, AffineDepth):
+        return affine.metric_scale(intrinsics)
+    return affine.metric_scale if isinstance(affine, AffinePoints) else None
+
+
+def scale_ratio(own: Prediction, changed: Prediction) -> Tensor:
+    """B: by how much the depth of a latent as it was exceeds that of the same latent after DyFN.
+
+    The median over a grid of pixels that are valid in both; NaN where there is none.
+    """
+    rows, columns = (size // RATIO_GRID + 1 for size in own.depth.shape[-2:])
+    grid = (slice(None), slice(None, None, rows), slice(None, None, columns))
+    both = (own.mask & changed.mask)[grid]
+    ratio = torch.where(both, own.depth[grid] / changed.depth[grid], torch.nan)
+    return ratio.flatten(1).nanmedian(dim=1).values
+
+
+def _in_metres(prediction: Prediction, scale: Tensor) -> Prediction:
+    depth = prediction.depth * scale[:, None, None]
+    points = prediction.points * scale[:, None, None, None]
+    return replace(prediction, depth=depth, points=points, metric=True)
 
 
 def assemble(
@@ -229,7 +348,30 @@ def assemble(
         depth = torch.where(valid, depth, torch.inf)
         invalid = (~valid).reshape(-1).nonzero()[:, 0]  # a mask broadcast over xyz is slow
         points = points.reshape(-1, 3).index_fill_(0, invalid, torch.inf).reshape(points.shape)
-    return Prediction(points, depth, valid, intrinsics, state)
+    normal = affine.normal
+    if normal is not None and apply_mask:
+        normal = normal * valid[..., None]
+    return Prediction(points, depth, valid, intrinsics, state, normal=normal)
+
+
+def from_depth(
+    affine: AffineDepth,
+    model: GeometryModel,
+    intrinsics: Tensor,
+    state: StreamState | None,
+    apply_mask: bool = True,
+) -> Prediction:
+    """Depth without a camera -> Prediction, batched, in the model's unit; a shift is taken for 0.
+
+    model: what gave the depth. intrinsics: B x 3 x 3, normalised.
+    """
+    depth = affine.depth
+    valid = (affine.mask > model.mask_threshold) & (depth > 0) & torch.isfinite(depth)
+    points = depth_to_points(depth, intrinsics)
+    if apply_mask:
+        depth = torch.where(valid, depth, torch.inf)
+        points = torch.where(valid[..., None], points, torch.inf)
+    return Prediction(points, depth, valid, intrinsics, state, model.quantity)
 
 
 def from_disparity(
@@ -254,20 +396,6 @@ def from_disparity(
     return Prediction(points, depth, valid, intrinsics, state, DISPARITY, disparity)
 
 
-def _of_disparity(
-    disparity: Tensor,
-    fov_x: float | Tensor | None,
-    state: StreamState | None,
-    apply_mask: bool,
-) -> Prediction:
-    """Every image in units of its own median."""
-    height, width = disparity.shape[-2:]
-    angle = NOMINAL_FOV if fov_x is None else fov_x
-    focal = focal_from_fov(angle, width / height, len(disparity))
-    intrinsics = intrinsics_from_focal(focal, width / height).to(disparity)
-    return from_disparity(disparity, median_disparity(disparity), intrinsics, state, apply_mask)
-
-
 def median_disparity(disparity: Tensor) -> Tensor:
     """B x H x W -> B: the median of each image's positive disparities, 1 where there is none."""
     positive = torch.where(disparity > 0, disparity, torch.nan).flatten(1)
@@ -283,6 +411,7 @@ def first_of_batch(prediction: Prediction) -> Prediction:
         mask=prediction.mask[0],
         intrinsics=prediction.intrinsics[0],
         disparity=None if prediction.disparity is None else prediction.disparity[0],
+        normal=None if prediction.normal is None else prediction.normal[0],
     )
 
 

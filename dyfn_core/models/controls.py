@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from dyfn_core.models.base import AffineDisparity, AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import Affine, GeometryModel, Latent
 from dyfn_core.models.dyfn import EMA_ALPHA, EPSILON, DyFN, DyFNConfig
 from dyfn_core.prediction import StreamState
 
@@ -69,7 +69,7 @@ def stabilized_by(model: GeometryModel, stabilizer: DyFN | None) -> Iterator[Geo
 
 def decode_with(
     model: GeometryModel, stabilizer: DyFN | None, latent: Latent, state: StreamState | None
-) -> tuple[AffinePoints | AffineDisparity, StreamState | None]:
+) -> tuple[Affine, StreamState | None]:
     """Decode a latent as if the model had this stabilizer.
 
     Args:

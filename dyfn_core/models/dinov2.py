@@ -100,9 +100,13 @@ class TransformerBlock(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """DINOv2 ViT-S/B/L with patch 14; the class token takes part but is not returned."""
+    """DINOv2 ViT-S/B/L with patch 14.
 
-    def __init__(self, name: str) -> None:
+    final_epsilon: of the norm after the last block. masks: whether the file has a mask_token, which
+    masked patches in pre-training and is unused here.
+    """
+
+    def __init__(self, name: str, final_epsilon: float = 1e-6, masks: bool = True) -> None:
         """name: one of SIZES. Raises ValueError for another."""
         super().__init__()
         if name not in SIZES:
@@ -111,10 +115,10 @@ class DinoV2(nn.Module):
         self.patch_embed = PatchEmbedding(self.channels)
         self.cls_token = nn.Parameter(torch.zeros(1, 1, self.channels))
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + TRAINED_GRID**2, self.channels))
-        # In every released file; masks patches in pre-training, unused here.
-        self.mask_token = nn.Parameter(torch.zeros(1, self.channels))
+        if masks:
+            self.mask_token = nn.Parameter(torch.zeros(1, self.channels))
         self.blocks = nn.ModuleList(TransformerBlock(self.channels, heads) for _ in range(depth))
-        self.norm = nn.LayerNorm(self.channels, eps=1e-6)
+        self.norm = nn.LayerNorm(self.channels, eps=final_epsilon)
 
     def forward(self, image: Tensor, layers: int | Sequence[int]) -> list[Tensor]:
         """image: B x 3 x H x W, normalised, H and W multiples of 14.
@@ -122,6 +126,12 @@ class DinoV2(nn.Module):
         layers: how many last blocks, or which blocks. Returns per block the patch tokens after
         the final norm, B x C x H/14 x W/14.
         """
+        return self.with_class_token(image, layers)[0]
+
+    def with_class_token(
+        self, image: Tensor, layers: int | Sequence[int]
+    ) -> tuple[list[Tensor], Tensor]:
+        """As forward, and the class token of the last of these blocks after the norm, B x C."""
         grid = (image.shape[-2] // PATCH, image.shape[-1] // PATCH)
         tokens = self.patch_embed(image)
         x = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1)
@@ -131,8 +141,9 @@ class DinoV2(nn.Module):
         for index in range(max(wanted) + 1):
             x = self.blocks[index](x)
             if index in wanted:
-                kept[index] = self.norm(x)[:, 1:].transpose(1, 2).unflatten(2, grid)
-        return [kept[index] for index in wanted]
+                kept[index] = self.norm(x)
+        maps = [kept[index][:, 1:].transpose(1, 2).unflatten(2, grid) for index in wanted]
+        return maps, kept[wanted[-1]][:, 0]
 
     def block_indices(self, layers: int | Sequence[int]) -> list[int]:
         """The blocks that `layers` means. Raises ValueError for blocks that do not exist."""

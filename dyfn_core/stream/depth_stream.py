@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from dyfn_core.geometry.camera import (
+    FocalShift,
     check_camera_matrix,
     focal_from_fov,
     intrinsics_from_focal,
@@ -23,14 +24,19 @@ from dyfn_core.geometry.camera import (
 )
 from dyfn_core.models.base import (
     NOMINAL_FOV,
+    Affine,
+    AffineDepth,
     AffineDisparity,
     AffinePoints,
     GeometryModel,
     assemble,
     first_of_batch,
+    from_depth,
     from_disparity,
     image_to_batch,
     median_disparity,
+    metric_scale,
+    scale_ratio,
 )
 from dyfn_core.prediction import Prediction, StreamState
 from dyfn_core.stream.resets import NEW_CAMERA, NEW_SIZE, REQUESTED, TimeRules
@@ -38,6 +44,9 @@ from dyfn_core.stream.resets import NEW_CAMERA, NEW_SIZE, REQUESTED, TimeRules
 logger = logging.getLogger(__name__)
 
 SHIFT_MODES = ("filtered", "held", "per_frame")
+# A stabilized stream's metres by the model's own word cost a second pass of the decoder: of so many
+# frames after a reset, and of every so-manieth then.
+MEASURED_FIRST, MEASURED_EVERY = 10, 10
 
 
 @dataclass(frozen=True)
@@ -129,9 +138,16 @@ class DepthStream:
 
     A model of disparity knows neither camera nor offset: depth is the inverse of its disparity in
     units of the first frame's median, an unknown camera is taken for one of NOMINAL_FOV, and
-    every prediction says quantity "disparity".
+    every prediction says quantity "disparity". Depth Anything 3 gives depth without a camera: its
+    depth is the stream's, and an unknown camera is taken for one of NOMINAL_FOV.
+
+    The depth of models that know metres is relative here, in one unit for the stream; the
+    prediction's `model_scale` has what the model says of the metres.
 
     Attributes:
+        normals: Whether predictions have normals, of models that have them.
+        model_metres: Whether to ask a stabilized model for its metres, which costs a second pass
+            of the decoder in some frames; one without DyFN says them anyway.
         rules: When stamps say that a frame cannot follow the one before.
         resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
         memory: All that the stream remembers.
@@ -188,6 +204,7 @@ class DepthStream:
         self.focal_filter = focal_filter or RobustMean()
         self.force_projection = force_projection
         self.rules = rules or TimeRules()
+        self.normals = self.model_metres = False
         self.resets: Counter[str] = Counter()
         self.memory = StreamMemory()
         self._last_reset: str | None = None
@@ -260,9 +277,10 @@ class DepthStream:
 
     def finish(
         self,
-        affine: AffinePoints | AffineDisparity,
+        affine: Affine,
         state: StreamState | None,
         stamp: float | None = None,
+        own: Affine | None = None,
     ) -> Prediction:
         """The half of push after the network, for callers that run the network themselves.
 
@@ -272,12 +290,31 @@ class DepthStream:
             affine: The frame's output, a batch of one.
             state: DyFN's state after the frame.
             stamp: Seconds.
+            own: What the decoder makes of the latent that DyFN has not changed; None if that was
+                not asked for, or DyFN does not run.
 
         Returns:
             As push.
         """
-        if isinstance(affine, AffineDisparity):
-            return self._finish_disparity(affine.disparity, state, stamp)
+        if isinstance(affine, AffinePoints):
+            prediction, memory = self._of_points(affine, state, stamp)
+        else:
+            prediction, memory = self._without_camera(affine, state, stamp)
+        if not self.normals:
+            prediction = replace(prediction, normal=None)
+        scale = self._model_scale(affine, own, prediction)
+        reset = None if self.memory.frames else self._last_reset
+        self.memory = memory
+        return replace(
+            first_of_batch(prediction),
+            known_camera=self.camera_matrix,
+            reset=reset,
+            model_scale=scale,
+        )
+
+    def _of_points(
+        self, affine: AffinePoints, state: StreamState | None, stamp: float | None
+    ) -> tuple[Prediction, StreamMemory]:
         valid = affine.mask > self.model.mask_threshold
         size = (valid.shape[-2], valid.shape[-1])
         self._make_room(size, None)
@@ -302,32 +339,66 @@ class DepthStream:
             state,
             self.force_projection,
         )
-        return self._finished(prediction, memory)
+        return prediction, memory
 
-    def _finish_disparity(
-        self, disparity: Tensor, state: StreamState | None, stamp: float | None
-    ) -> Prediction:
-        size = (disparity.shape[-2], disparity.shape[-1])
+    def _without_camera(
+        self, affine: AffineDepth | AffineDisparity, state: StreamState | None, stamp: float | None
+    ) -> tuple[Prediction, StreamMemory]:
+        size = (affine.values.shape[-2], affine.values.shape[-1])
         self._make_room(size, None)
-        unit = self.memory.unit
-        if unit is None:
-            unit = float(median_disparity(disparity))
         if self._camera_matrix is not None:
             intrinsics = torch.from_numpy(normalize_intrinsics(self._camera_matrix, size))[None]
         else:
             focal = focal_from_fov(NOMINAL_FOV, size[1] / size[0], 1)
             intrinsics = intrinsics_from_focal(focal, size[1] / size[0])
-        prediction = from_disparity(
-            disparity, disparity.new_tensor([unit]), intrinsics.to(disparity), state
-        )
-        memory = replace(self.memory.after(size, stamp, state), unit=unit)
-        return self._finished(prediction, memory)
+        intrinsics = intrinsics.to(affine.values)
+        memory = self.memory.after(size, stamp, state)
+        if isinstance(affine, AffineDepth):
+            return from_depth(affine, self.model, intrinsics, state), memory
+        disparity, unit = affine.disparity, memory.unit
+        if unit is None:
+            unit = float(median_disparity(disparity))
+        prediction = from_disparity(disparity, disparity.new_tensor([unit]), intrinsics, state)
+        return prediction, replace(memory, unit=unit)
 
-    def _finished(self, prediction: Prediction, memory: StreamMemory) -> Prediction:
-        """Remember the frame; its prediction, with all that the stream knows of it."""
-        reset = None if self.memory.frames else self._last_reset
-        self.memory = memory
-        return replace(first_of_batch(prediction), known_camera=self.camera_matrix, reset=reset)
+    @property
+    def measures(self) -> bool:
+        """Whether the coming frame must be decoded without DyFN as well, for its metres."""
+        if not (self.model_metres and self.stabilize and self._metres_can_be_known):
+            return False
+        frames = self.memory.frames
+        return frames < MEASURED_FIRST or frames % MEASURED_EVERY == 0
+
+    @property
+    def _metres_can_be_known(self) -> bool:
+        known = self.model.knows_metres
+        return bool(known) and (known != "camera" or self._camera_matrix is not None)
+
+    def _model_scale(
+        self, affine: Affine, own: Affine | None, prediction: Prediction
+    ) -> float | None:
+        """Metres in one unit of this frame's depth, by the model; None where it says nothing."""
+        if not self._metres_can_be_known or (self.stabilize and own is None):
+            return None
+        scale = metric_scale(affine, prediction.intrinsics)
+        if scale is None:
+            return None
+        ratio = 1.0 if own is None else float(scale_ratio(self._own(own, prediction), prediction))
+        found = float(scale) * ratio
+        return found if math.isfinite(found) and found > 0 else None
+
+    def _own(self, own: Affine, prediction: Prediction) -> Prediction:
+        """What the model says of this frame by itself, with the stream's camera."""
+        if isinstance(own, AffineDepth):
+            return from_depth(own, self.model, prediction.intrinsics, None)
+        assert isinstance(own, AffinePoints)  # disparity knows no metres
+        valid = own.mask > self.model.mask_threshold
+        size = (valid.shape[-2], valid.shape[-1])
+        samples, usable = sample(own.points, valid)
+        xyz, uv = samples[0][usable[0]], sampled_uv(*size)[usable[0]]
+        found = _shift_of(xyz, uv, prediction.intrinsics[0].cpu().numpy(), size)
+        shift = own.points.new_tensor([found.shift])
+        return assemble(own, valid, shift, prediction.intrinsics, None)
 
     def _track_focal(self, memory: StreamMemory, xyz: np.ndarray, uv: np.ndarray) -> StreamMemory:
         found = solve_focal_shift(xyz, uv)
@@ -343,11 +414,7 @@ class DepthStream:
         intrinsics: np.ndarray,
         size: tuple[int, int],
     ) -> tuple[StreamMemory, float]:
-        # Stretched by the focals, x and y project with focal 1 whatever the pixels' aspect. The
-        # network assumes a centred principal point, so its points are compared with centred rays.
-        half = math.hypot(*size) / 2
-        scale = [intrinsics[0, 0] * size[1] / half, intrinsics[1, 1] * size[0] / half, 1.0]
-        found = solve_focal_shift(xyz * scale, uv, focal=1.0)
+        found = _shift_of(xyz, uv, intrinsics, size)
         if not found.solved:
             return memory, 0.0 if memory.shift is None else memory.shift.value
         if self.shift_mode == "per_frame":
@@ -358,6 +425,17 @@ class DepthStream:
         # A shift from other frames must not put this one's near parts behind the camera.
         floor = -0.98 * float(np.quantile(xyz[:, 2], 0.02))
         return replace(memory, shift=track), max(track.value, floor)
+
+
+def _shift_of(
+    xyz: np.ndarray, uv: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
+) -> FocalShift:
+    """The z-shift of sampled points of an image of size (H, W) with a known camera."""
+    # Stretched by the focals, x and y project with focal 1 whatever the pixels' aspect. The
+    # network assumes a centred principal point, so its points are compared with centred rays.
+    half = math.hypot(*size) / 2
+    scale = [intrinsics[0, 0] * size[1] / half, intrinsics[1, 1] * size[0] / half, 1.0]
+    return solve_focal_shift(xyz * scale, uv, focal=1.0)
 
 
 def push_together(
@@ -409,14 +487,19 @@ def push_together(
         for stream, stamp in zip(streams, stamps, strict=True):
             stream._make_room((frames[0].shape[-2], frames[0].shape[-1]), stamp)
         state = StreamState.stack([stream.memory.state for stream in streams])
-        affine, state = first.model.predict_affine(
-            frames[0] if len(frames) == 1 else torch.cat(frames),
-            state,
-            first.num_tokens,
-            first.stabilize,
-        )
+        model = first.model
+        batch = frames[0] if len(frames) == 1 else torch.cat(frames)
+        latent = model.encode(batch, first.num_tokens)
+        changed, state = model.stabilized(latent, state, first.stabilize)
+        normals = any(stream.normals for stream in streams)
+        affine = model.decode_all(changed) if normals else model.decode(changed)
+        own = [
+            model.decode(latent.entry(i)) if stream.measures else None
+            for i, stream in enumerate(streams)
+        ]
         states: Sequence[StreamState | None]
         states = [None] * len(streams) if state is None else state.unbind()
         return [
-            stream.finish(affine.entry(i), states[i], stamps[i]) for i, stream in enumerate(streams)
+            stream.finish(affine.entry(i), states[i], stamps[i], own[i])
+            for i, stream in enumerate(streams)
         ]

@@ -14,6 +14,7 @@ from dyfn_core.evaluation.report.variants import over_median
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.controls import latent_controls, stabilized_by
 from dyfn_core.prediction import Prediction
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.threads import computing_threads
@@ -124,7 +125,9 @@ def _evaluate(
     write: Write,
 ) -> SequenceEvaluation:
     """Every frame read, run and scored; `write` takes it too."""
-    evaluation = SequenceEvaluation(reader.expected, outputs.depth_max, model.quantity)
+    evaluation = SequenceEvaluation(
+        reader.expected, outputs.depth_max, scored_quantity(model.quantity)
+    )
     frames = tqdm(
         reader.frames(),
         total=reader.expected,

@@ -17,6 +17,7 @@ from dyfn_core.models.base import GeometryModel, image_to_batch
 from dyfn_core.models.controls import decode_with, latent_controls, stabilized_by
 from dyfn_core.models.dyfn import DyFN
 from dyfn_core.prediction import DISPARITY, Prediction
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.stream.depth_stream import DepthStream
 
 BASE = ", base"  # ends the name of the variant without DyFN
@@ -63,7 +64,7 @@ class ModelMethod:
     @property
     def quantity(self) -> str:
         """See predictions.Method."""
-        return self.model.quantity
+        return scored_quantity(self.model.quantity)
 
     @property
     def variants(self) -> tuple[str, ...]:

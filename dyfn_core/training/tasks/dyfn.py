@@ -13,6 +13,8 @@ from torch import Tensor
 
 from dyfn_core.data.clips import draw_batch, find_sequences
 from dyfn_core.models.base import (
+    Affine,
+    AffineDepth,
     AffineDisparity,
     AffinePoints,
     GeometryModel,
@@ -22,6 +24,7 @@ from dyfn_core.models.base import (
 from dyfn_core.models.checkpoints import load_model
 from dyfn_core.models.dyfn import DyFN, DyFNConfig, build_dyfn
 from dyfn_core.prediction import StreamState
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.scoring.variants import VariantScore, VariantScorers, mean_scores
 from dyfn_core.training.config import ConfigError
 from dyfn_core.training.dyfn_config import DyFNRunConfig
@@ -65,7 +68,7 @@ class DyFNTask(Task):
 
     def decode(
         self, latents: Tensor, image_size: tuple[int, int], network_size: tuple[int, int]
-    ) -> AffinePoints | AffineDisparity:
+    ) -> Affine:
         """Decode clips at half their size.
 
         Args:
@@ -81,10 +84,11 @@ class DyFNTask(Task):
         shape = latents.shape[:2]
         if isinstance(affine, AffineDisparity):
             return AffineDisparity(torch.unflatten(affine.disparity.float(), 0, shape))
-        points, mask = (
-            torch.unflatten(part.float(), 0, shape) for part in (affine.points, affine.mask)
-        )
-        return AffinePoints(points, mask)
+        values = affine.points if isinstance(affine, AffinePoints) else affine.depth
+        values, mask = (torch.unflatten(part.float(), 0, shape) for part in (values, affine.mask))
+        if isinstance(affine, AffinePoints):
+            return AffinePoints(values, mask)
+        return AffineDepth(values, mask)
 
     def validate(self) -> dict[str, float]:
         """Image and video AbsRel with and without DyFN; `score` is the rendered video's.
@@ -106,7 +110,7 @@ class DyFNTask(Task):
 
     def _score(self, sequence: Sequence, stabilized: bool) -> VariantScore | None:
         state: StreamState | None = None
-        scorers = VariantScorers(("dyfn",), self.model.quantity)
+        scorers = VariantScorers(("dyfn",), scored_quantity(self.model.quantity))
         for features, depth in zip(sequence.latent, sequence.depth, strict=True):
             features = features[None].to(self.model.device).float()
             latent = Latent(features, sequence.image_size, sequence.network_size)
@@ -208,11 +212,11 @@ def unroll(model: GeometryModel, clips: LatentClips) -> list[Latent]:
     return outputs
 
 
-def _far_is_large(affine: AffinePoints | AffineDisparity) -> Tensor:
+def _far_is_large(affine: Affine) -> Tensor:
     """z, or the inverse of disparity, for pictures."""
     if isinstance(affine, AffineDisparity):
         return 1 / affine.disparity.clamp(min=1e-6)
-    return affine.points[..., 2]
+    return affine.values
 
 
 def build_frozen(config: DyFNRunConfig) -> GeometryModel:

@@ -24,8 +24,9 @@ from dyfn_core.losses.sampled.disparity import (
 from dyfn_core.losses.sampled.temporal import temporal_loss
 from dyfn_core.losses.sampled.whole_frame import align_frames, global_loss
 from dyfn_core.losses.scale_spread import scale_spread_loss
-from dyfn_core.losses.target import ClipTarget, target_from_depth
-from dyfn_core.models.base import AffineDisparity, AffinePoints
+from dyfn_core.losses.target import ClipTarget, on_rays, target_from_depth
+from dyfn_core.models.base import Affine, AffineDepth, AffineDisparity, AffinePoints
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.training.config import ConfigError
 from dyfn_core.training.dyfn_config import (
     DisparityObjective,
@@ -61,7 +62,7 @@ class UnrolledTask(DyFNTask):
             )
 
     def _check_objective(self) -> None:
-        objective, quantity = self.method.objective, self.model.quantity
+        objective, quantity = self.method.objective, scored_quantity(self.model.quantity)
         wanted = "disparity" if isinstance(objective, DisparityObjective) else "depth"
         if quantity == wanted:
             return
@@ -96,6 +97,9 @@ class UnrolledTask(DyFNTask):
         depth = batch.depth[:, frames].float().flatten(0, 1)
         aspect = batch.image_size[1] / batch.image_size[0]
         truth = target_from_depth(depth, batch.intrinsics[:, frames].flatten(0, 1), aspect)
+        if isinstance(affine, AffineDepth):  # the losses are of points: on the true rays
+            points = on_rays(affine.depth.flatten(0, 1), batch.intrinsics[:, frames].flatten(0, 1))
+            affine = AffinePoints(torch.unflatten(points, 0, affine.depth.shape[:2]), affine.mask)
         with full_precision(depth):
             total, terms = self._terms(affine, ClipTarget(truth, len(frames)), frames)
         values = {name: float(term.detach()) for name, term in terms.items()}
@@ -114,7 +118,7 @@ class UnrolledTask(DyFNTask):
         return sorted([*chosen, *others[: count - len(chosen)]])
 
     def _terms(
-        self, affine: AffinePoints | AffineDisparity, target: ClipTarget, frames: list[int]
+        self, affine: Affine, target: ClipTarget, frames: list[int]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum, and every term by name."""
         objective = self.method.objective

@@ -166,7 +166,7 @@ def decoded_z(model: GeometryModel, latent: Latent) -> Tensor:
     affine = model.decode(latent)
     if isinstance(affine, AffineDisparity):
         raise ConfigError("the scale of a base of disparity is not a scale of depth")
-    return affine.points[..., 2].clamp(min=1e-6)
+    return affine.values.clamp(min=1e-6)
 
 
 def mean_log(z: Tensor, depth: Tensor) -> Tensor:

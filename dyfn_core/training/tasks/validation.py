@@ -13,6 +13,7 @@ import torch
 from dyfn_core.data.frames import FrameError, FrameSequence
 from dyfn_core.data.sequences import folder_frames
 from dyfn_core.models.base import GeometryModel, image_to_batch
+from dyfn_core.quantities import scored_quantity
 from dyfn_core.scoring.protocols import SequenceScorer
 
 logger = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ def score(model: GeometryModel, examples: list[Example]) -> dict[str, float]:
 
     NaN when no example has enough known depth to be scored.
     """
-    scorer = SequenceScorer(quantity=model.quantity)
+    scorer = SequenceScorer(quantity=scored_quantity(model.quantity))
     for example in examples:
         affine = model.decode(model.encode(image_to_batch(example.image, model.device)[0]))
         scorer.push(affine.values[0].float().cpu().numpy(), example.depth)

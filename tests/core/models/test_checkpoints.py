@@ -305,7 +305,7 @@ def test_hub_download_is_used_when_there_is_a_network(
 ) -> None:
     path, asked = written(tmp_path / "blob", official), []
 
-    def download(repo_id: str, filename: str) -> str:
+    def download(repo_id: str, filename: str, **_: object) -> str:
         asked.append((repo_id, filename))
         return str(path)
 

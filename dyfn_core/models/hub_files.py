@@ -1,0 +1,149 @@
+"""Hub ids -> files on this machine, downloaded if need be; refusals come before downloads."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from dyfn_core.models.formats import CheckpointError
+
+logger = logging.getLogger(__name__)
+
+# Hub id, and its file with the weights.
+SUPPORTED = {
+    "Ruicheng/moge-vitl": "model.pt",
+    "Ruicheng/moge-2-vitl": "model.pt",
+    "Ruicheng/moge-2-vitl-normal": "model.pt",
+    "Ruicheng/moge-2-vitb-normal": "model.pt",
+    "Ruicheng/moge-2-vits-normal": "model.pt",
+    "shawlyu/DyFN": "DyFN.pt",
+    "depth-anything/Depth-Anything-V2-Small": "depth_anything_v2_vits.pth",
+    "depth-anything/Depth-Anything-V2-Base": "depth_anything_v2_vitb.pth",
+    "depth-anything/Depth-Anything-V2-Large": "depth_anything_v2_vitl.pth",
+    "depth-anything/DA3MONO-LARGE": "model.safetensors",
+    "depth-anything/DA3METRIC-LARGE": "model.safetensors",
+}
+_FILES = {repo.lower(): file for repo, file in SUPPORTED.items()}
+# Of whom the name of a repository tells what is in it, and what that is.
+_UNSUPPORTED = (
+    (r"depth-anything/da3.*", "Depth Anything 3 for several views"),
+    (r"depth-anything/depth-anything-v2-.*-hf", "Depth Anything V2 in the format of transformers"),
+    (r"depth-anything/depth-anything-v2-metric-.*", "metric Depth Anything V2"),
+    (r"depth-anything/video-depth-anything-.*", "Video Depth Anything"),
+    (r"depth-anything/.*", "another model of Depth Anything"),
+    (r"liheyoung/.*", "Depth Anything V1"),
+    (r"ruicheng/moge-2.*", "another MoGe v2"),
+    (r"ruicheng/moge-3.*", "MoGe v3"),
+    (r"ruicheng/.*", "another MoGe"),
+)
+WEIGHTS, CONFIG = "model.safetensors", "config.json"  # in repositories of save_pretrained
+LIBRARY = "dyfn_ros"  # in their config.json
+ANSWER = 4.0  # seconds that the Hub has to answer
+
+_HUB_ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(/(?P<file>.+))?")
+
+
+def is_hub_id(name: str) -> bool:
+    """Whether a name has the form owner/name, or owner/name/file."""
+    return _HUB_ID.fullmatch(name) is not None
+
+
+def model_folder() -> Path:
+    """Where files downloaded by hand are looked for: $DYFN_MODELS or ~/.cache/dyfn/models."""
+    chosen = os.environ.get("DYFN_MODELS")
+    return Path(chosen) if chosen else Path.home() / ".cache" / "dyfn" / "models"
+
+
+def locate(name: str) -> Path:
+    """The file with a Hub model's weights, on this machine.
+
+    Args:
+        name: See is_hub_id.
+
+    Raises:
+        CheckpointError: The repository holds something that is not supported; nothing but its
+            config.json, a small file, has been downloaded then.
+        FileNotFoundError: No such file, or no network; says what to put where.
+    """
+    match = _HUB_ID.fullmatch(name)
+    assert match is not None, name
+    repo, file = match["repo"], match["file"]
+    known = _FILES.get(repo.lower())
+    if known is None:
+        _refuse_by_name(repo)
+    if file or known:
+        return fetch(repo, file or known or "")
+    by_hand = model_folder() / repo
+    for one in (by_hand / WEIGHTS, by_hand / "model.pt"):
+        if one.is_file():
+            return one
+    _refuse_by_config(repo, fetch(repo, CONFIG, wanted=WEIGHTS))
+    return fetch(repo, WEIGHTS)
+
+
+def _refuse_by_name(repo: str) -> None:
+    for pattern, what in _UNSUPPORTED:
+        if re.fullmatch(pattern, repo.lower()):
+            raise CheckpointError(f"Hub model {repo} is {what}: not supported; {_choice()}")
+
+
+def _refuse_by_config(repo: str, path: Path) -> None:
+    """Raises CheckpointError unless config.json is one that save_pretrained wrote."""
+    try:
+        found: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"Hub model {repo}: its {CONFIG} is no JSON: {error}") from error
+    if isinstance(found, dict) and found.get("library") == LIBRARY:
+        return
+    keys = ("library", "model_type", "model_name", "architectures", "_class_name")
+    said = {key: found[key] for key in keys if isinstance(found, dict) and key in found}
+    raise CheckpointError(
+        f"Hub model {repo} is not supported: its {CONFIG} says {said or 'nothing of a model'}; "
+        f"{_choice()}. {_by_file(repo)}"
+    )
+
+
+def _choice() -> str:
+    return "supported are " + ", ".join(SUPPORTED) + " and models pushed by DyFNModel"
+
+
+def _by_file(repo: str) -> str:
+    return f"A checkpoint in a supported format is named with its file: {repo}/FILE"
+
+
+def fetch(repo: str, file: str, wanted: str = "") -> Path:
+    """A repository's file: put there by hand, in the Hub's cache, or downloaded.
+
+    wanted: what to put by hand where this file cannot be had; "" is the file itself.
+    """
+    by_hand = model_folder() / repo / file
+    if by_hand.is_file():
+        return by_hand
+    from huggingface_hub import constants, hf_hub_download, hf_hub_url, try_to_load_from_cache
+    from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+
+    cached = try_to_load_from_cache(repo, file)
+    if isinstance(cached, str):
+        return Path(cached)
+    logger.info("fetching %s of %s from the Hub", file, repo)
+    try:
+        return Path(hf_hub_download(repo_id=repo, filename=file, etag_timeout=ANSWER))
+    except Exception as error:  # many kinds, by version: no network, no such file, no access
+        absent = isinstance(error, EntryNotFoundError)
+        if wanted and absent and not isinstance(error, LocalEntryNotFoundError):
+            raise CheckpointError(
+                f"Hub model {repo} is not supported: it has no {file} that says what it is; "
+                f"{_choice()}. {_by_file(repo)}"
+            ) from error
+        file = wanted or file
+        raise FileNotFoundError(
+            f"no such file here, and cannot download {file} of Hub model {repo} "
+            f"({type(error).__name__}: {error}). "
+            f"Download {hf_hub_url(repo, file)} on a machine with a network and put it at "
+            f"{model_folder() / repo / file} (or anywhere, and pass its path). "
+            f"The Hub's cache is {constants.HF_HUB_CACHE}"
+        ) from error
