@@ -158,8 +158,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     write_benchmark_report(path, _title(opened), table, results, pictures, method.seconds)
     tables = [table, metres_table(results)]
     printed = "\n\n".join(text_table(found) for found in tables if found.rows)
-    code = _finish(printed, results, options.out)
-    return PARTIAL if options.strict and results["warnings"] else code
+    return _finish(printed, results, options)
 
 
 def _long(options: argparse.Namespace) -> int:
@@ -177,7 +176,7 @@ def _long(options: argparse.Namespace) -> int:
     results = {**_provenance(options), **results}
     write_json(options.out / "results.json", results)
     write_lengths(results, options.out, _title(opened))
-    return _finish(text_table(length_table(results)), results, options.out)
+    return _finish(text_table(length_table(results)), results, options)
 
 
 def _provenance(options: argparse.Namespace) -> dict[str, Any]:
@@ -191,12 +190,13 @@ def _title(opened: Opened) -> str:
     return f"{opened.benchmark.title}, {count} sequence{'s' if count != 1 else ''}"
 
 
-def _finish(table: str, results: dict[str, Any], out: Path) -> int:
+def _finish(table: str, results: dict[str, Any], options: argparse.Namespace) -> int:
     print(table)
-    print(f"written to {out}")
+    print(f"written to {options.out}")
     for name in results["missing"]:
         _note(f"not scored: {name}")
-    return PARTIAL if results["missing"] else COMPLETE
+    doubted = options.strict and results["warnings"]
+    return PARTIAL if results["missing"] or doubted else COMPLETE
 
 
 def _note(line: str) -> None:
@@ -255,6 +255,7 @@ def _add_long(commands: Commands) -> None:
         metavar="N",
         help=f"frames (default: {' '.join(map(str, LENGTHS))})",
     )
+    add_strict(command.add_argument_group("checks"))
     command.set_defaults(run=_long)
 
 

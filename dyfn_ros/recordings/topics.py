@@ -61,6 +61,16 @@ class Topics:
     depth_info: str | None = None
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
+    @property
+    def names(self) -> dict[str, str | None]:
+        """What they are used for -> their names."""
+        return {
+            "image": self.image,
+            "camera_info": self.camera_info,
+            "depth": self.depth,
+            "depth_info": self.depth_info,
+        }
+
 
 @dataclass
 class _Found:

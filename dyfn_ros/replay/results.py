@@ -96,7 +96,7 @@ def _metrics(
         "warnings": result.doubts,
         "recording": {
             "path": str(source.recording),
-            "topics": vars(recording.topics),
+            "topics": recording.topics.names,
             "losses": dict(recording.notes.losses),
             "warnings": dict(recording.notes.warnings),
         },

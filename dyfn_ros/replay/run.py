@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from dyfn_core.evaluation.report.variants import over_median
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.controls import latent_controls, stabilized_by
 from dyfn_core.prediction import Prediction
@@ -162,8 +161,8 @@ def _output(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]
 
 
 def _shown(name: str, evaluation: SequenceEvaluation, metres_per_unit: float | None) -> ShownRun:
-    scales = over_median(evaluation.column("scale"))
-    return ShownRun(name, _alignment(evaluation, metres_per_unit), scales)
+    ratios = evaluation.column("video_ratio")
+    return ShownRun(name, _alignment(evaluation, metres_per_unit), ratios)
 
 
 def _alignment(evaluation: SequenceEvaluation, metres_per_unit: float | None) -> Alignment:

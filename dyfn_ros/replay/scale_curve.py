@@ -1,4 +1,4 @@
-"""The scale of each frame over time, as far as a video has come."""
+"""The drift of the scale over time, as far as a video has come."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 
 COLOURS = ((31, 111, 214), (217, 102, 10))  # as the report's first two lines
 GREY, BLACK = (200, 200, 200), (0, 0, 0)
-MARGIN = (40, 24, 12, 22)  # pixels left, above, right and below
-TITLE = "scale that fits each frame, over its median (flat: no drift)"
+MARGIN = (40, 24, 12, 36)  # pixels left, above, right and below
+LINE = 14  # pixels from one name to the next
+TITLE = "true over predicted depth, one alignment (flat: no drift)"
 
 
 class ScaleCurve:
     """Draws lines that grow with the frames, on axes that stay.
 
-    lines: name -> scale over its median of every frame, NaN for none. seconds: of every frame from
-    the first; where they fall, frames are counted.
+    lines: name -> true over aligned depth of every frame, NaN for none; beside the name stands the
+    drift so far, the standard deviation of its log. seconds: of every frame from the first; where
+    they fall, frames are counted.
     """
 
     def __init__(self, lines: Mapping[str, np.ndarray], seconds: np.ndarray) -> None:
@@ -50,8 +52,9 @@ class ScaleCurve:
         _write(picture, f"{self._x[number]:.1f} {self._unit}", (size[1] - 70, size[0] - 6))
         for place, (name, values) in enumerate(self._lines.items()):
             colour = COLOURS[place % len(COLOURS)]
-            _write(picture, name, (left + 120 * place, size[0] - 6), colour)
             known = np.flatnonzero(np.isfinite(values[: number + 1]))
+            so_far = f", drift {np.std(np.log(values[known])):.3f}" if known.size > 1 else ""
+            _write(picture, name + so_far, (left, size[0] - 6 - LINE * place), colour)
             if known.size:
                 points = np.stack([x[known], rows(values[known])], axis=1).round().astype(np.int32)
                 runs = np.split(points, np.flatnonzero(np.diff(known) > 1) + 1)

@@ -1,4 +1,4 @@
-"""A run as the outputs for people show it: its name, its alignment, its scale over time."""
+"""A run as the outputs for people show it: its name, its alignment, its drift over time."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class ShownRun:
     Attributes:
         name: What it is called.
         alignment: Of its predictions.
-        scales: Each frame's own scale over the median of all, NaN where there is none.
+        ratios: True over aligned depth of each frame, as SequenceScore.ratios; NaN without truth.
     """
 
     name: str
     alignment: Alignment
-    scales: np.ndarray
+    ratios: np.ndarray

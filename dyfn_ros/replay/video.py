@@ -1,4 +1,4 @@
-"""The MP4 of a replay: input, truth, base and result, in colours that stay the same; the scale."""
+"""The MP4 of a replay: input, truth, base and result, in colours that stay the same; the drift."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_video(path: Path, spool: FrameSpool, runs: Sequence[ShownRun]) -> None
     """H.264 of all frames at the pace of their stamps.
 
     One alignment for each run and one range of colours for all frames, so that drift and flicker
-    are seen; truth, errors and scale are there when any frame has truth. Raises OutputError.
+    are seen; truth, errors and drift are there when any frame has truth. Raises OutputError.
 
     Args:
         path: The file; it appears only when it is complete.
@@ -78,7 +78,7 @@ class _Panels:
         self._curve: ScaleCurve | None = None
         if self._truth:
             self._bars.append(error_bar())
-            lines = {run.name: run.scales for run in self._runs}
+            lines = {run.name: run.ratios for run in self._runs}
             self._curve = ScaleCurve(lines, (np.array(stamps) - stamps[0]) / 1e9)
 
     def _depths(self, frame: SmallFrame) -> list[np.ndarray]:
@@ -94,7 +94,7 @@ class _Panels:
     def draw(self, number: int, frame: SmallFrame) -> np.ndarray:
         """Rows x columns x 3 uint8 RGB.
 
-        Above: input, truth, base, result; below, with truth: the scale so far, and the errors.
+        Above: input, truth, base, result; below, with truth: the drift so far, and the errors.
         """
         depths = dict(zip([run.name for run in self._runs], self._depths(frame), strict=True))
         ordered = dict(reversed(depths.items()))  # the base, then the result

@@ -13,18 +13,23 @@ from matplotlib.figure import Figure
 from dyfn_core.data.frames import DataError, FrameError
 from dyfn_core.evaluation.benchmarks.predictions import Method
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkSequence, Opened
+from dyfn_core.evaluation.benchmarks.report import data_sections, facts_section, role, shown_table
 from dyfn_core.evaluation.benchmarks.run import (
     Note,
     Scoring,
     mean_of,
+    observed,
     plain_settings,
     variant_scorers,
     versions,
 )
-from dyfn_core.evaluation.report.html import Cell, Table
+from dyfn_core.evaluation.report.curves import Curves
+from dyfn_core.evaluation.report.html import Cell, Part, Section, Table, Text, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
 from dyfn_core.evaluation.report.tables import write_tables
-from dyfn_core.scoring.protocols import SequenceScorer
+from dyfn_core.evaluation.report.variants import Variant, headline, key_figures
+from dyfn_core.scoring.plausibility import Plausibility
+from dyfn_core.scoring.protocols import SequenceScorer, drift
 
 LENGTHS = (100, 200, 300, 400, 500)
 Point = dict[str, Any]
@@ -36,16 +41,19 @@ def length_curve(
     lengths: Sequence[int],
     depth_max: float,
     scoring: Scoring,
+    plausibility: Plausibility | None = None,
 ) -> dict[int, dict[str, Point]]:
-    """length -> variant -> video and image metrics over the first `length` frames.
+    """length -> variant -> video and image metrics and drift over the first `length` frames.
 
     Lengths that the sequence does not reach are left out. Memory is that of Scoring.max_samples
-    per variant, whatever the length. Raises FrameError or DataError, naming file or sequence.
+    per variant, whatever the length. plausibility: takes the frames. Raises FrameError or
+    DataError, naming file or sequence.
     """
+    frames = sequence.frames() if plausibility is None else observed(sequence, plausibility)
     scorers = variant_scorers(method, depth_max, scoring)
     predict = method.open(sequence)
     curve: dict[int, dict[str, Point]] = {}
-    for count, frame in enumerate(sequence.frames(), start=1):
+    for count, frame in enumerate(frames, start=1):
         try:
             scorers.push(predict(count - 1, frame), frame.truth)
         except ValueError as error:
@@ -62,6 +70,7 @@ def _point(scorer: SequenceScorer) -> Point:
     return {
         "video": None if video is None else video.metrics,
         "image": None if image is None else image.metrics,
+        "drift": drift(video),
         "alignment": None if video is None else {"scale": video.scale, "shift": video.shift},
     }
 
@@ -84,10 +93,12 @@ def long_sequences(
     if not lengths or min(lengths) < 1:
         raise ValueError(f"lengths must be positive numbers of frames, got {list(lengths)}")
     scoring, wanted = scoring or Scoring(), sorted(set(lengths))
-    missing, curves = list(opened.missing), {}
+    missing, curves, warnings = list(opened.missing), {}, []
     for sequence in opened.sequences:
+        doubted = Plausibility(min(len(sequence), wanted[-1]))
+        limit = opened.settings.depth_max
         try:
-            curve = length_curve(sequence, method, wanted, opened.settings.depth_max, scoring)
+            curve = length_curve(sequence, method, wanted, limit, scoring, doubted)
         except (FrameError, DataError) as error:
             if not allow_missing:
                 raise
@@ -95,6 +106,9 @@ def long_sequences(
             continue
         curves[sequence.name] = curve
         note(f"{sequence.name}: {len(sequence)} frames, {len(curve)} of {len(wanted)} lengths")
+        for text in doubted.warnings(None):
+            warnings.append(f"{sequence.name}: {text}")
+            note(f"{sequence.name}: implausible: {text}")
     reached = {n: [c[n] for c in curves.values() if n in c] for n in wanted}
     if not reached[wanted[0]]:
         raise DataError(f"no sequence has {wanted[0]} frames that could be scored")
@@ -105,6 +119,7 @@ def long_sequences(
         "versions": versions(),
         "missing": missing,
         "problems": opened.report.problems,
+        "warnings": warnings,
         "lengths": {
             str(n): {"sequences": len(points), "variants": mean_of(points)}
             for n, points in reached.items()
@@ -164,6 +179,48 @@ def draw_lengths(results: dict[str, Any], title: str) -> np.ndarray:
 
 
 def write_lengths(results: dict[str, Any], folder: Path, title: str) -> None:
-    """lengths.csv, .md, .tex and lengths.png in the folder."""
-    write_tables(folder, "lengths", length_table(results), title)
+    """lengths.csv, .md, .tex, lengths.png and report.html in the folder."""
+    table = length_table(results)
+    write_tables(folder, "lengths", table, title)
     (folder / "lengths.png").write_bytes(encode_picture(draw_lengths(results, title)))
+    write_report(
+        folder / "report.html", f"{title}: error against length", _sections(results, table)
+    )
+
+
+def _sections(results: dict[str, Any], table: Table) -> list[Section]:
+    """What the report of a run has, with the lengths in place of frames."""
+    length, longest = list(results["lengths"].items())[-1]
+    names = longest["variants"]
+    variants = [
+        Variant(n, role(n), {**scores, "frames": int(length)}) for n, scores in names.items()
+    ]
+    lead = Text(f"Over {length} frames under one alignment: {headline(variants)}", lead=True)
+    return [
+        Section("At a glance", [lead, key_figures(variants)]),
+        *data_sections(results),
+        Section("Error against length", [*_curves(results), shown_table(table)]),
+        facts_section(results),
+    ]
+
+
+def _curves(results: dict[str, Any]) -> list[Part]:
+    found = results["lengths"]
+    lengths = [int(length) for length in found]
+    names = list(dict.fromkeys(name for point in found.values() for name in point["variants"]))
+    muted = {name for name in names if role(name) == "control"}
+
+    def curve(metric: str, unit: str) -> Part:
+        lines = {
+            name: [_score(point["variants"].get(name), metric) for point in found.values()]
+            for name in names
+        }
+        title = f"{metric}, one alignment for all frames (video)"
+        return Curves(title, lines, "frames that share one alignment", unit, lengths, muted)
+
+    return [curve("abs_rel", "AbsRel (share of the true depth)"), curve("delta1", "share")]
+
+
+def _score(point: Point | None, metric: str) -> float | None:
+    video = None if point is None else point["video"]
+    return None if video is None else float(video[metric])

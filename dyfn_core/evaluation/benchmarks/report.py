@@ -50,16 +50,11 @@ def write_benchmark_report(
     notes = [Text(NOTE, note=True), Text(PICTURE_NOTE, note=True)]
     sections = [
         Section("At a glance", [Text(headline(variants), lead=True), key_figures(variants)]),
-        Section("Scores", [_shown_table(table, metres=not times), *notes]),
+        *data_sections(results),
+        Section("Scores", [shown_table(table, metres=not times), *notes]),
     ]
     if (metres := metres_table(results)).rows:
         sections.append(Section("In metres, without alignment", [metres]))
-    if results["missing"]:
-        rows = [[name] for name in results["missing"]]
-        sections.append(Section("Not scored", [Table(("sequence",), rows)]))
-    if results["warnings"]:
-        doubts: list[list[Cell]] = [[text] for text in results["warnings"]]
-        sections.append(Section("Implausible", [Table(("",), doubts)]))
     for found in results["sequences"]:
         name = found["name"]
         parts = over_time(_sequence_variants(found))
@@ -68,11 +63,33 @@ def write_benchmark_report(
         sections.append(Section(f"Over time, {name}", parts))
     sections += _worst(pictures.worst)
     sections += [latency_section(times)] if times else []
-    sections.append(Section("By sequence", [_shown_table(sequence_table(results))]))
+    sections.append(Section("By sequence", [shown_table(sequence_table(results))]))
+    write_report(path, title, [*sections, facts_section(results)])
+
+
+def data_sections(results: dict[str, Any]) -> list[Section]:
+    """What is doubted, what of the data could not be used, and what was not scored."""
+    found = []
+    if results["warnings"]:
+        doubts: list[list[Cell]] = [[text] for text in results["warnings"]]
+        found.append(Section("Implausible", [Table(("",), doubts)]))
+    if results["problems"]:
+        rows: list[list[Cell]] = [
+            [f"{reason} ({names[0]}{', ...' if names[1:] else ''})", len(names)]
+            for reason, names in results["problems"].items()
+        ]
+        found.append(Section("Not used", [Table(("", "times"), rows)]))
+    if results["missing"]:
+        missing: list[list[Cell]] = [[name] for name in results["missing"]]
+        found.append(Section("Not scored", [Table(("sequence",), missing)]))
+    return found
+
+
+def facts_section(results: dict[str, Any]) -> Section:
+    """Options, settings and versions of a run, those that are set."""
     facts = {**results.get("options", {}), **results["settings"], **results["versions"]}
-    facts_table = Table(("", ""), [[name, str(value)] for name, value in facts.items()])
-    sections.append(Section("What was run", [facts_table]))
-    write_report(path, title, sections)
+    rows = [[name, str(value)] for name, value in facts.items() if value is not None]
+    return Section("What was run", [Table(("", ""), rows)])
 
 
 def _worst(worst: Sequence[WorstFrame]) -> list[Section]:
@@ -120,7 +137,7 @@ def _sequence_variants(sequence: dict[str, Any]) -> list[Variant]:
     ]
 
 
-def _shown_table(table: Table, metres: bool = True) -> Table:
+def shown_table(table: Table, metres: bool = True) -> Table:
     """Without columns that are empty; controls grey. metres: False leaves the metric protocol out,
     for depth that no model says to be in metres."""
     header = [*table.header]

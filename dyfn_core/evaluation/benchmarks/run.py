@@ -72,9 +72,9 @@ def score_sequence(
     plausibility = Plausibility(len(sequence.numbers))
     with TemporalScorer() as temporal:
         steady = temporal if scoring.temporal else None
-        observed = _observed(sequence, plausibility)
+        frames_seen = observed(sequence, plausibility)
         predict = method.open(sequence)
-        frames = _push_all(sequence.name, observed, predict, scorers, depth_max, steady, taken)
+        frames = _push_all(sequence.name, frames_seen, predict, scorers, depth_max, steady, taken)
         variants = {name: _summary(scorer) for name, scorer in scorers.scorers.items()}
         steadiness: dict[str, Any] = {}
         if scoring.temporal:
@@ -106,7 +106,8 @@ def score_sequence(
     }
 
 
-def _observed(sequence: BenchmarkSequence, plausibility: Plausibility) -> Iterator[BenchmarkFrame]:
+def observed(sequence: BenchmarkSequence, plausibility: Plausibility) -> Iterator[BenchmarkFrame]:
+    """The frames of a sequence, which plausibility takes too, but for those of context."""
     for frame in sequence.frames():
         if not frame.context:
             plausibility.push(frame.image, frame.truth, camera_matrix=frame.camera_matrix)

@@ -219,9 +219,3 @@ def seconds_axis(stamps: np.ndarray | None) -> tuple[np.ndarray | None, str]:
     if stamps is None or not len(stamps) or (np.diff(stamps) < 0).any():
         return None, FRAMES
     return stamps - stamps[0], SECONDS
-
-
-def over_median(values: np.ndarray) -> np.ndarray:
-    """Values over the median of those that are not NaN; all NaN when that is 0 or nothing is."""
-    middle = float(np.nanmedian(values)) if np.isfinite(values).any() else 0.0
-    return values / middle if middle else np.full(len(values), np.nan)

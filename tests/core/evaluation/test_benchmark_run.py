@@ -310,6 +310,26 @@ def test_long_from_the_command_line(tmp_path: Path) -> None:
     ]
     picture = cv2.imread(str(tmp_path / "out" / "lengths.png"))
     assert picture is not None and picture.std() > 5
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Over 9 frames under one alignment: The scale of drift wanders by" in page
+    assert "Error against length" in page and "Implausible" not in page
+    assert read(tmp_path / "out")["warnings"] == []
+
+
+def test_long_says_what_is_implausible(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, folder = room(tmp_path / "root", 3), tmp_path / "drift"
+    folder.mkdir()
+    sequence = open_benchmark("tum", root).sequences[0]
+    np.save(folder / f"{sequence.name}.npy", np.stack(list(moving_scale(sequence))))
+    for path in root.glob("*/depth/*.png"):
+        cv2.imwrite(str(path), np.full(TUM, 5000, np.uint16))
+    arguments = ["long", "--benchmark", "tum", "--root", str(root), "--lengths", "3"]
+    arguments += ["--predictions", str(folder), "--out", str(tmp_path / "out")]
+    assert cli.main(arguments) == 0 and cli.main([*arguments, "--strict"]) == 3
+    said = "the ground truth is one depth all over, in each of 3 frames"
+    assert read(tmp_path / "out")["warnings"] == [f"{sequence.name}: {said}"]
+    assert f"implausible: {said}" in capsys.readouterr().err
+    assert said in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_memory_of_long_sequences_does_not_grow(tmp_path: Path) -> None:

@@ -209,6 +209,23 @@ def test_base_and_result_share_the_colours_of_the_video_and_the_report(tmp_path:
     assert middle["base model"] == pytest.approx(middle["ground truth"] * 7 / 8)
 
 
+def test_the_curve_of_the_video_has_the_drift_of_the_metrics() -> None:
+    from dyfn_core.evaluation.sequence import SequenceEvaluation
+    from dyfn_ros.replay.run import _shown
+
+    rng = np.random.default_rng(3)
+    evaluation = SequenceEvaluation(6)
+    for index in range(6):
+        truth = rng.uniform(1, 4, SIZE).astype(np.float32)
+        depth = (truth * (1 + 0.1 * index) + 0.2).astype(np.float32)
+        valid = np.ones(SIZE, bool)
+        evaluation.push(np.zeros((*SIZE, 3), np.uint8), depth, valid, None if index == 2 else truth)
+    ratios = _shown("run", evaluation, None).ratios
+    assert np.isnan(ratios[2]) and np.isfinite(np.delete(ratios, 2)).all()
+    drift = evaluation.results()["drift"]["log_std"]
+    assert np.std(np.log(np.delete(ratios, 2))) == pytest.approx(drift) and drift > 0.1
+
+
 def test_the_rerun_recording_can_be_read_back(
     tmp_path: Path, written: Callable[..., list[str]]
 ) -> None:
