@@ -120,11 +120,16 @@ def choose_topics(
         {IMAGE, COMPRESSED_IMAGE, POINT_CLOUD},
         _nearest(depths, chosen),
     )
+    info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
     remarks = [] if depth is not None else [*_depth_remarks(found, depths, chosen, truth)]
+    if camera_info is None and info is not None and _apart(chosen, info):
+        remarks.append(
+            f"{info} is the only CameraInfo, in another namespace than {chosen}: of another "
+            "camera? --camera-info-topic none does without"
+        )
     if image is None and len(coloured) < len(visible):
         wide = ", ".join(f"{n} ({found.encodings[n]})" for n in visible if n not in coloured)
         remarks.append(f"not used: {wide}; 16 bits of grey are depth when --depth-topic says so")
-    info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
     images_own = truth is not None and kinds[truth] != POINT_CLOUD
     own = [name for name in _siblings(kinds, truth or "") if images_own and name != info]
     return Topics(
@@ -156,8 +161,7 @@ def _depth_remarks(
             f"{truth} is taken for depth by its encoding {encoding}, its name does not say so; "
             "--depth-topic none does without"
         )
-    ours, theirs = _whose(image), _whose(truth)
-    if ours and theirs and ours[0] != theirs[0]:
+    if _apart(image, truth):
         yield (
             f"{truth} is the only depth, in another namespace than {image}: of another camera? "
             "--depth-topic none does without"
@@ -364,6 +368,12 @@ def _nearest(depths: list[str], image: str) -> list[str]:
 def _shared(one: list[str], other: list[str]) -> int:
     """How many parts two names have in common from the start."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
+
+
+def _apart(one: str, other: str) -> bool:
+    """Whether two topics are of different things by their namespaces."""
+    ours, theirs = _whose(one), _whose(other)
+    return bool(ours and theirs and ours[0] != theirs[0])
 
 
 def _whose(name: str) -> list[str]:

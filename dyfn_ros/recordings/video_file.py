@@ -89,7 +89,7 @@ def video_frames(
     if late and len(late) == decoded - 1:
         raise RecordingError(
             f"{path}: holds no times of its {decoded} frames (a raw H.264 or H.265 stream has "
-            "none); put it into a container such as .mp4, or give dyfn-record --rate"
+            "none); give --rate to dyfn-record, or put it into a container such as .mp4"
         )
     if late:
         warn(f"{path}: {len(late)} frames whose time does not rise are left out ({late[0]})")

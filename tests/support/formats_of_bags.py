@@ -523,6 +523,9 @@ BAGS: dict[str, Maker] = {
     "picture of depth alone": of(
         lambda: [*colours("/cam/depth/image_colored")],
     ),
+    "the only CameraInfo in another camera's namespace": of(
+        lambda: [*colours("/front/image"), *infos("/rear/camera_info"), *truths("/front/depth")]
+    ),
     "CameraInfo of another size": of(lambda: [*colours(), *truths(), *infos(size=(480, 640))]),
     "CameraInfo's `frame_id` with a slash": of(
         lambda: [*colours(), *truths(), *infos(frame="/camera")]
