@@ -144,9 +144,9 @@ def _open_folder(path: Path) -> Storage:
     if contents.renamed and not losses and found == contents.messages:
         remarks = [f"{f}: metadata.yaml names it otherwise" for f in contents.renamed]
         return ChainedStorage([*parts.values()], (), remarks)
-    told = losses or contents.missing or contents.renamed or contents.unlisted
-    told = told or any(part.losses for part in parts.values())
-    if not told and contents.messages is not None and found < contents.messages:
+    damaged = losses or contents.missing or any(part.losses for part in parts.values())
+    others = contents.renamed or contents.unlisted
+    if not damaged and not others and contents.messages is not None and found < contents.messages:
         losses.append(
             f"{path}: metadata.yaml counts {contents.messages} messages, {found} are there"
         )
