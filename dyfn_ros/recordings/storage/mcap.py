@@ -20,7 +20,6 @@ from mcap.records import (
     ChunkIndex,
     Footer,
     McapRecord,
-    Message,
     Schema,
     Statistics,
 )
@@ -39,6 +38,7 @@ from dyfn_ros.recordings.storage.forms import Form, message_form
 
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log and publish time; then the data
 _FOOTER = 20
 _END = _HEAD.size + _FOOTER + len(MAGIC)
 _OPCODES = {int(opcode) for opcode in Opcode}
@@ -139,10 +139,10 @@ class McapFile(ChunkedFile):
         """Messages; schemas and channels are remembered. Raises one of DAMAGE."""
         for opcode, content in records:
             if opcode == Opcode.MESSAGE:
-                message = Message.read(ReadDataStream(BytesIO(content)), len(content))
-                channel = self._channels[message.channel_id]
+                key, _, log_ns, _ = _MESSAGE.unpack_from(content)
+                channel = self._channels[key]
                 form = self._form(channel)
-                log_ns, data = message.log_time, message.data
+                data = content[_MESSAGE.size :]
                 yield Recorded(channel.topic, form.kind, log_ns, data, form.to_cdr)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 record: Any = parse(opcode, content)
