@@ -12,7 +12,7 @@ from dyfn_core.stream.resets import TimeRules
 from dyfn_core.stream.scene_cut import THRESHOLD
 
 STREAM, SCALE = "Stream", "Metric scale"
-SOURCES = ("none", "fixed", "reference", "camera_height", "odometry")
+SOURCES = ("none", "fixed", "reference", "camera_height", "odometry", "model")
 UNTIL_METRIC = ("withhold", "relative")
 AFTER_RESET = ("keep", "withhold")
 
@@ -133,7 +133,7 @@ class StreamOptions:
         "none",
         "Source of metres. none: depth is relative. fixed: metric_scale. reference: measurements "
         "on `reference`. camera_height: height over the ground. odometry: poses of the moving "
-        "camera, which also steady the depth.",
+        "camera, which also steady the depth. model: what a metric model says, filtered.",
         choices=SOURCES,
     )
     metric_scale: float = option(

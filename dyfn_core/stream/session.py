@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyfn_core.prediction import DISPARITY, Frame, Prediction
+from dyfn_core.prediction import AFFINE_DEPTH, DISPARITY, Frame, Prediction
 from dyfn_core.stream.depth_stream import DepthStream, same_camera
 from dyfn_core.stream.metric_stage import MetricStage
+from dyfn_core.stream.model_stage import ModelStage
 from dyfn_core.stream.motion_stage import MotionStage
 from dyfn_core.stream.options import StreamOptions, options_of
 from dyfn_core.stream.picture_stage import PictureStage
@@ -63,6 +64,7 @@ class StreamSession:
         resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
         last_reset: The last reset as a line of a log; "" before the first.
         stream: What holds the memory; None before the first frame and after a failed one.
+        normals: Whether the predictions of the frames to come have normals, if the model does.
 
     Example:
         >>> from dyfn_core.models import load_model
@@ -90,18 +92,17 @@ class StreamSession:
             stages: Of the caller's own; they come after those of the session.
 
         Raises:
-            ValueError: An option that is not allowed, or metres of a model that predicts
-                disparity.
+            ValueError: An option that is not allowed, or metres that the model's output cannot
+                have.
         """
         self.model = model
         self._options = options = options or StreamOptions()
-        if model.quantity == DISPARITY and options.metric_source != "none":
-            raise ValueError(
-                f"metric_source is {options.metric_source!r}, but the model predicts disparity, "
-                "whose unknown shift no metric scale undoes; expected 'none'"
-            )
-        by_motion = options.metric_source == MotionStage.source
-        metric: type[ScaleStage] = MotionStage if by_motion else MetricStage
+        check_metres(model, options)
+        stages_by_source: dict[str, type[ScaleStage]] = {
+            MotionStage.source: MotionStage,
+            ModelStage.source: ModelStage,
+        }
+        metric = stages_by_source.get(options.metric_source, MetricStage)
         self._metric = metric(lambda: self._options)
         cuts = SceneCutStage(
             lambda: self._options.scene_cut_threshold, lambda frame: self._place(frame)
@@ -112,6 +113,7 @@ class StreamSession:
         self.last_reset = ""
         self._place: Place = _as_it_is
         self.stream: DepthStream | None = None
+        self.normals = False
         self.asked = ResetRequest()
         self._keeper = StateKeeper(self.stages, model)
         self._done = ResetRequest()  # what was asked for before the last frame
@@ -332,6 +334,8 @@ class StreamSession:
         if reason:
             self.last_reset = self._told(frame, reason)
         self.stream.rules = self._options.time_rules
+        self.stream.model_metres = self._options.metric_source == ModelStage.source
+        self.stream.normals = self.normals
         self._done, self._settings = asked, self._settings_with(frame.frame_id)
         self._failed = False
         return self.stream
@@ -409,6 +413,28 @@ class StreamSession:
         for stage in self.stages:
             stage.started(reason)
         return stream
+
+
+def check_metres(model: GeometryModel, options: StreamOptions) -> None:
+    """Raises ValueError when metric_source is not for what the model predicts."""
+    source = options.metric_source
+    if source == ModelStage.source and not model.knows_metres:
+        raise ValueError(
+            f"metric_source is {source!r}, but the model knows no metres; expected a metric one "
+            "(MoGe v2, Depth Anything 3 metric) or another source"
+        )
+    if model.quantity == DISPARITY and source != "none":
+        raise ValueError(
+            f"metric_source is {source!r}, but the model predicts disparity, "
+            "whose unknown shift no metric scale undoes; expected 'none'"
+        )
+    with_shift = source == "reference" and options.calibration_fit == "scale_shift"
+    if model.quantity == AFFINE_DEPTH and source != "none" and not with_shift:
+        raise ValueError(
+            f"metric_source is {source!r}, but the model's depth has an unknown shift, which a "
+            "scale alone does not undo; expected 'none', or 'reference' with calibration_fit "
+            "'scale_shift'"
+        )
 
 
 @contextmanager

@@ -47,7 +47,7 @@ class SavedStream:
 
     memory: the DepthStream's. camera_matrix: 3 x 3 float64 pixels, or None.
     calibration: of the metric scale; cut: of the scene cut detector; motion: of the scale from the
-    camera's motion; None when there is none.
+    camera's motion; model_scale: of the scale that the model says; None when there is none.
     options: what the stream was made with. notes: the caller's own, text to text.
     """
 
@@ -58,6 +58,7 @@ class SavedStream:
     motion: MotionScaleState | None = None
     options: dict[str, Any] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    model_scale: FilterState | None = None
 
 
 # The names are a part of the format: a class that is renamed keeps the name that files have.
@@ -102,6 +103,7 @@ def save_stream(
     calibration: ScaleCalibration | None = None,
     cut: CutState | None = None,
     motion: MotionScaleState | None = None,
+    model_scale: FilterState | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
     """Write a stream's state, whole or not at all: an older file stays until then.
@@ -117,6 +119,7 @@ def save_stream(
         motion,
         stream_options(stream),
         dict(notes or {}),
+        model_scale,
     )
     tensors: dict[str, Tensor] = {}
     content = json.dumps(

@@ -101,7 +101,8 @@ def parser() -> argparse.ArgumentParser:
         choices=METRIC_SOURCES,
         default="none",
         help="source of metres. none: depth is relative. fixed: --metric-scale. camera_height: "
-        "height over the ground. dyfn-replay has those of recordings (default: none)",
+        "height over the ground. model: what a metric model says. dyfn-replay has those of "
+        "recordings (default: none)",
     )
     group = made.add_argument_group("run", "what is run over the frames")
     add_model(group)

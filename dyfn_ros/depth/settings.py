@@ -16,7 +16,7 @@ NONE = "none"
 RATE = 10.0  # pictures a second of a folder
 PNG_VALUES = 1000.0  # stored values of a 16-bit PNG per unit of depth: millimetres of metres
 PANEL = 1280  # pixels of the longer side of a panel of the video
-METRIC_SOURCES = ("none", "fixed", "camera_height")
+METRIC_SOURCES = ("none", "fixed", "camera_height", "model")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ __all__ = [
     "decode_image",
     "depth_fields",
     "depth_message",
+    "normal_message",
 ]
 
 
@@ -104,6 +105,14 @@ def colour_message(header: Any, rgb: np.ndarray) -> Any:
     height, width = rgb.shape[:2]
     fields = {"height": height, "width": width, "encoding": "rgb8", "step": 3 * width}
     return _image(header, {**fields, "data": rgb})
+
+
+def normal_message(header: Any, normal: np.ndarray, valid: np.ndarray) -> Any:
+    """H x W x 3 unit normals -> sensor_msgs.msg.Image, 32FC3, NaN where not valid."""
+    height, width = normal.shape[:2]
+    values = np.where(valid[..., None], normal, np.nan).astype("<f4")
+    fields = {"height": height, "width": width, "encoding": "32FC3", "step": 12 * width}
+    return _image(header, {**fields, "is_bigendian": 0, "data": values})
 
 
 def _image(header: Any, fields: dict[str, Any]) -> Any:

@@ -214,6 +214,11 @@ class Camera:
         self.odometry.open(self.settings, self._warn)
         self.session = session
 
+    def open_outputs(self) -> None:
+        """Once the stream is open: the topics that not every model fills."""
+        if self._opened().model.has_normals:
+            self.outputs.advertise_normals()
+
     def decode(self, job: FrameJob) -> tuple[Frame, CameraInfo | None]:
         """-> the frame and the CameraInfo that describes it as it now is.
 
@@ -244,6 +249,7 @@ class Camera:
         """-> the DepthStream that the frame goes into."""
         session = self._opened()
         session.options = self.settings
+        session.normals = self.outputs.wants_normals(self.settings)
         self._look_at_dropped(session, job)
         self._placed = None
 

@@ -142,6 +142,8 @@ class StreamDepthNode(LifecycleNode):
         if self._worker.error is not None or self._interrupted:
             self._release_all(0.0)
             return FAILURE
+        for camera in self._cameras:
+            camera.open_outputs()
         self._phase = "inactive"
         return super().on_configure(state)
 
@@ -350,6 +352,16 @@ class StreamDepthNode(LifecycleNode):
                     f"{settings.model} predicts disparity, right up to scale and shift: the depth "
                     "published is its inverse over the first frame's median, so shapes are bent "
                     "as far as that shift is not 0; no metric scale makes it metres"
+                )
+            elif model.quantity == "affine_depth":
+                self.get_logger().warning(
+                    f"{settings.model} predicts depth up to scale and shift, and the shift is "
+                    "taken for 0: shapes are bent as far as it is not; metric_source:=reference "
+                    "with calibration_fit:=scale_shift finds both"
+                )
+            elif model.knows_metres and "model" not in sources:
+                self.get_logger().info(
+                    f"{settings.model} knows metres itself: metric_source:=model uses them"
                 )
 
     # The end.

@@ -15,7 +15,12 @@ from dyfn_core.prediction import Prediction
 from dyfn_ros.messages.camera_info import camera_info_message
 from dyfn_ros.messages.clouds import cloud_message, pack_cloud
 from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
-from dyfn_ros.messages.images import colour_message, compressed_message, depth_message
+from dyfn_ros.messages.images import (
+    colour_message,
+    compressed_message,
+    depth_message,
+    normal_message,
+)
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 
@@ -25,7 +30,7 @@ _RESETS_DEPTH = 10
 
 
 class NodeOutputs:
-    """The topics `~/depth/...`, `~/points` and `~/resets` of one camera.
+    """The topics `~/depth/...`, `~/points`, `~/normal` and `~/resets` of one camera.
 
     prefix: "" or "CAMERA/", before each of these names. The inference thread publishes.
     """
@@ -47,8 +52,19 @@ class NodeOutputs:
         self._info = advertise(CameraInfo, "depth/camera_info")
         self._colored = advertise(Image, "depth/colored")
         self._points = advertise(PointCloud2, "points")
+        self._normal: Any = None
+        self._advertise = advertise
         self._resets = ports.publisher(DiagnosticArray, f"~/{prefix}resets", latched)
         self._colours = ColourScale()
+
+    def advertise_normals(self) -> None:
+        """`~/normal`, for a model that has them."""
+        self._normal = self._advertise(Image, "normal")
+
+    def wants_normals(self, settings: NodeSettings) -> bool:
+        """Whether the coming frame's normals are worth computing."""
+        wanted = self._normal is not None and settings.publish_normal
+        return wanted and bool(self._normal.get_subscription_count())
 
     def publish(
         self,
@@ -78,6 +94,9 @@ class NodeOutputs:
         if settings.publish_points and self._points.get_subscription_count():
             cloud = filtered_cloud(prediction, valid, image, settings)
             self._points.publish(cloud_message(header, cloud))
+
+        if prediction.normal is not None and self.wants_normals(settings):
+            self._normal.publish(normal_message(header, prediction.normal, valid))
 
     def publish_reset(self, header: Any, name: str, reason: str, counts: dict[str, int]) -> None:
         """header: of the first frame after the reset. counts: resets so far, by reason."""

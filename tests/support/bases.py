@@ -84,9 +84,10 @@ def _da3_weights() -> dict[str, torch.Tensor]:
     model = DepthAnything3Model(DepthAnything3Config("mono", encoder="dinov2_vits14"))
     scratch = model.model.head.scratch
     with torch.no_grad():
-        for stack, bias in ((scratch.output_conv2, 0.7), (scratch.sky_output_conv2, 0.28)):
+        for stack, bias in ((scratch.output_conv2, 0.7), (scratch.sky_output_conv2, 0.1)):
             last = stack[2]
             assert isinstance(last, nn.Conv2d)
             assert last.bias is not None
             last.bias.fill_(bias)
+            last.weight.mul_(10.0)  # a depth that varies
     return model.state_dict()

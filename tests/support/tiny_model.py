@@ -6,6 +6,7 @@ Two pictures make it behave badly on demand: see FAILING and BLOCKING.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ CHANNELS = 6
 
 
 class TinyModel(GeometryModel):
+    has_normals = True
+
     def __init__(self) -> None:
         super().__init__()
         self.encoder = nn.Conv2d(3, CHANNELS, 5, stride=4, padding=2)
@@ -60,6 +63,10 @@ class TinyModel(GeometryModel):
         )
         points = torch.stack([u * z, v * z, z], dim=-1)
         return AffinePoints(points, raw[:, 1] - raw[:, 1].mean((1, 2), keepdim=True) + 0.9)
+
+    def decode_all(self, latent: Latent) -> AffinePoints:
+        affine = self.decode(latent)
+        return replace(affine, normal=-functional.normalize(affine.points, dim=-1))
 
 
 def wait_for_go() -> None:

@@ -22,8 +22,8 @@ def load(name: str, device: str) -> GeometryModel:
     from tests.support.pinhole import PinholeModel
     from tests.support.tiny_model import load_tiny
 
-    for builder in ("depth_message", "cloud_message", "colour_message", "compressed_message"):
-        report(builder)
+    for kind in ("depth", "cloud", "colour", "compressed", "normal"):
+        report(f"{kind}_message")
     if name in ("pinhole", "pinhole with DyFN"):
         return PinholeModel(stabilized=name != "pinhole").eval()
     return load_tiny(name, device)

@@ -164,6 +164,13 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         changes=RUN,
         per_camera=True,
     )
+    publish_normal: bool = _parameter(
+        _OUTPUT,
+        True,
+        "Publish ~/normal, of a model that has normals, when somebody subscribes.",
+        changes=RUN,
+        per_camera=True,
+    )
     min_depth: float = _parameter(
         _OUTPUT,
         0.0,

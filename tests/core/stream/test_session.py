@@ -14,6 +14,7 @@ from dyfn_core.metric.calibration import FITS, MODES, CalibrationOptions
 from dyfn_core.metric.scale import SOURCES, ScaleOptions
 from dyfn_core.prediction import DISPARITY, Frame, Prediction
 from dyfn_core.stream.metric_stage import scale_options
+from dyfn_core.stream.model_stage import ModelStage
 from dyfn_core.stream.motion_stage import MotionStage
 from dyfn_core.stream.options import StreamOptions, add_options, options_from, options_of
 from dyfn_core.stream.resets import (
@@ -257,7 +258,11 @@ def test_the_scale_is_found_with_the_library_s_defaults() -> None:
     assert scale_options(StreamOptions()) == ScaleOptions()
     assert ScaleOptions().calibration == CalibrationOptions()
     described = options_of(StreamOptions)
-    assert described["metric_source"].choices == (*SOURCES, MotionStage.source)
+    assert described["metric_source"].choices == (
+        *SOURCES,
+        MotionStage.source,
+        ModelStage.source,
+    )
     assert described["calibration"].choices == MODES
     assert described["calibration_fit"].choices == FITS
 

@@ -450,8 +450,34 @@ def test_depth_alone_is_built_for_its_subscriber_and_an_interrupt_waits_for_nobo
     received, done, dropped = map(int, re.search(summary, node.log).groups())
     assert received == done + dropped + 1  # the one that never ends
     assert node.log.count("depth_message") > 0
-    for other in ("cloud_message", "colour_message", "compressed_message"):
-        assert other not in node.log
+    for other in ("cloud", "colour", "compressed", "normal"):
+        assert f"{other}_message" not in node.log
+
+
+def test_normals_of_a_model_that_has_them_go_to_their_subscriber(client: Client) -> None:
+    matrix = calibrate(client)
+    found: list[Image] = []
+    subscription = client.node.create_subscription(Image, f"{NODE}/normal", found.append, 10)
+    image = frames(1)[0]
+
+    def came() -> bool:
+        client.result(client.send(image))
+        return bool(found)
+
+    client.wait(came)
+    client.node.destroy_subscription(subscription)
+    message = found[-1]
+    assert (message.encoding, message.height, message.width) == ("32FC3", 36, 48)
+    normals = np.frombuffer(message.data, np.float32).reshape(36, 48, 3)
+    stream = DepthStream(load_tiny(), camera_matrix=matrix)
+    stream.normals = True
+    wanted = stream.push(image)
+    assert wanted.normal is not None
+    # A first frame's mask; the node's stream is older, the direction of this model's rays is not.
+    valid = np.isfinite(normals).all(axis=-1)
+    assert valid.any()
+    both = valid & wanted.mask.numpy()
+    np.testing.assert_allclose(normals[both], wanted.normal.numpy()[both], atol=1e-5)
 
 
 def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
