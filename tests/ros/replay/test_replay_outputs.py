@@ -219,7 +219,9 @@ def test_the_curve_of_the_video_has_the_drift_of_the_metrics() -> None:
         truth = rng.uniform(1, 4, SIZE).astype(np.float32)
         depth = (truth * (1 + 0.1 * index) + 0.2).astype(np.float32)
         valid = np.ones(SIZE, bool)
-        evaluation.push(np.zeros((*SIZE, 3), np.uint8), depth, valid, None if index == 2 else truth)
+        target = None if index == 2 else truth
+        image = np.zeros((*SIZE, 3), np.uint8)
+        evaluation.push(image, depth, valid, target, stamp=index / 10, latency=0.1)
     ratios = _shown("run", evaluation, None).ratios
     assert np.isnan(ratios[2]) and np.isfinite(np.delete(ratios, 2)).all()
     drift = evaluation.results()["drift"]["log_std"]
