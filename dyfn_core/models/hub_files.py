@@ -108,7 +108,7 @@ def _refuse_by_config(repo: str, path: Path) -> None:
 
 
 def _choice() -> str:
-    return "supported are " + ", ".join(SUPPORTED) + ""
+    return "supported are " + ", ".join(SUPPORTED)
 
 
 def _by_file(repo: str) -> str:
