@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -128,6 +129,11 @@ class AffineDisparity:
 
 
 Affine = AffinePoints | AffineDepth | AffineDisparity
+
+
+def own_entries(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A checkpoint's config without what is not of the model's class: its type and its DyFN."""
+    return {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
 
 
 class GeometryModel(nn.Module, ABC):

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent
+from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent, own_entries
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.models.dpt import DPTHead, resized
 
@@ -81,13 +81,7 @@ class DepthAnythingModel(GeometryModel):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> DepthAnythingModel:
         """config: DepthAnythingConfig's fields. ValueError for unknown or bad keys."""
-        own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
-        known = {field.name for field in fields(DepthAnythingConfig)}
-        if unknown := sorted(set(own) - known):
-            raise ValueError(
-                f"unknown keys for Depth Anything V2: {unknown}, known are {sorted(known)}"
-            )
-        return cls(DepthAnythingConfig(**own))
+        return cls(DepthAnythingConfig(**known_entries(config, DepthAnythingConfig, "V2")))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -109,13 +103,7 @@ class DepthAnythingModel(GeometryModel):
             least = self.settings.input_size
             factor = max(least / height, least / width)
             return _at_least(factor * height, least), _at_least(factor * width, least)
-        if num_tokens < 1:
-            raise ValueError(f"num_tokens must be at least 1, got {num_tokens}")
-        factor = math.sqrt(num_tokens / (height * width))
-        return (
-            max(1, round(height * factor)) * PATCH,
-            max(1, round(width * factor)) * PATCH,
-        )
+        return budget_size(image_size, num_tokens)
 
     def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
         """image B x 3 x H x W in 0..1 -> the last fused map, four cells a token along each side."""
@@ -135,14 +123,37 @@ class DepthAnythingModel(GeometryModel):
 def official_encoder(weights: dict[str, Tensor]) -> str:
     """Which DINOv2 an official state dict holds. Raises ValueError when it is none of VARIANTS."""
     token = weights.get("pretrained.cls_token")
-    channels = None if token is None else token.shape[-1]
+    return encoder_of(None if token is None else token.shape[-1], "V2")
+
+
+def encoder_of(channels: int | None, version: str) -> str:
+    """Which of VARIANTS has so many channels. Raises ValueError that names the version."""
     for name in VARIANTS:
         if SIZES[name][0] == channels:
             return name
     raise ValueError(
-        f"an encoder of {channels} channels is none of Depth Anything V2's that are supported: "
-        + ", ".join(f"{name} ({SIZES[name][0]})" for name in VARIANTS)
+        f"an encoder of {channels} channels is none of Depth Anything {version}'s that are "
+        "supported: " + ", ".join(f"{name} ({SIZES[name][0]})" for name in VARIANTS)
     )
+
+
+def known_entries(config: dict[str, Any], kind: type, version: str) -> dict[str, Any]:
+    """A checkpoint's entries for a config class. Raises ValueError for others."""
+    own, known = own_entries(config), {field.name for field in fields(kind)}
+    if unknown := sorted(set(own) - known):
+        raise ValueError(
+            f"unknown keys for Depth Anything {version}: {unknown}, known are {sorted(known)}"
+        )
+    return own
+
+
+def budget_size(image_size: tuple[int, int], num_tokens: int) -> tuple[int, int]:
+    """(H, W) in multiples of 14 of about num_tokens tokens. Raises ValueError below one."""
+    if num_tokens < 1:
+        raise ValueError(f"num_tokens must be at least 1, got {num_tokens}")
+    height, width = image_size
+    factor = math.sqrt(num_tokens / (height * width))
+    return max(1, round(height * factor)) * PATCH, max(1, round(width * factor)) * PATCH
 
 
 def _at_least(side: float, least: int) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -17,8 +17,14 @@ import torch
 from torch import Tensor, nn
 
 from dyfn_core.models.base import AffineDepth, GeometryModel, Latent
-from dyfn_core.models.depth_anything import VARIANTS, Variant
-from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
+from dyfn_core.models.depth_anything import (
+    VARIANTS,
+    Variant,
+    budget_size,
+    encoder_of,
+    known_entries,
+)
+from dyfn_core.models.dinov2 import PATCH, DinoV2
 from dyfn_core.models.dpt import DPTHead, resized
 from dyfn_core.prediction import AFFINE_DEPTH, DEPTH
 
@@ -95,13 +101,7 @@ class DepthAnything3Model(GeometryModel):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> DepthAnything3Model:
         """config: DepthAnything3Config's fields. ValueError for unknown or bad keys."""
-        own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
-        known = {field.name for field in fields(DepthAnything3Config)}
-        if unknown := sorted(set(own) - known):
-            raise ValueError(
-                f"unknown keys for Depth Anything 3: {unknown}, known are {sorted(known)}"
-            )
-        return cls(DepthAnything3Config(**own))
+        return cls(DepthAnything3Config(**known_entries(config, DepthAnything3Config, "3")))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -121,13 +121,9 @@ class DepthAnything3Model(GeometryModel):
         Without a budget the official rule: the longer side becomes process_size, then each side
         the nearest multiple of 14.
         """
-        height, width = image_size
         if num_tokens is not None:
-            if num_tokens < 1:
-                raise ValueError(f"num_tokens must be at least 1, got {num_tokens}")
-            factor = math.sqrt(num_tokens / (height * width))
-            rows, columns = max(1, round(height * factor)), max(1, round(width * factor))
-            return [(rows * PATCH, columns * PATCH)]
+            return [budget_size(image_size, num_tokens)]
+        height, width = image_size
         factor = self.settings.process_size / max(height, width)
         first = (max(1, round(height * factor)), max(1, round(width * factor)))
         return [first, (_nearest_patches(first[0]), _nearest_patches(first[1]))]
@@ -184,14 +180,7 @@ def official_kind(names: Iterable[str]) -> str | None:
 
 def official_encoder(weights: dict[str, Tensor]) -> str:
     """Which DINOv2 an official state dict holds. Raises ValueError when it is none of VARIANTS."""
-    channels = weights[ENCODER_KEY].shape[-1]
-    for name in VARIANTS:
-        if SIZES[name][0] == channels:
-            return name
-    raise ValueError(
-        f"an encoder of {channels} channels is none of Depth Anything 3's that are supported: "
-        + ", ".join(f"{name} ({SIZES[name][0]})" for name in VARIANTS)
-    )
+    return encoder_of(weights[ENCODER_KEY].shape[-1], "3")
 
 
 def _bytes(image: Tensor) -> np.ndarray:

@@ -19,6 +19,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from dyfn_core.models import depth_anything, depth_anything3
+from dyfn_core.models.base import own_entries
 from dyfn_core.models.dyfn import DyFNConfig
 from dyfn_core.models.moge import MoGeConfig
 from dyfn_core.models.moge2 import EncoderConfig, MoGe2Config
@@ -187,12 +188,7 @@ def _from_official_config(config: dict[str, Any], path: Path) -> dict[str, Any]:
         if not isinstance(kind, str) or kind.lower() not in ("convgru", "gru"):
             raise CheckpointError(f"{path}: stabilizer_type {kind!r} is unknown")
         ours["stabilizer"] = DyFNConfig(kind=kind.lower()).to_dict()
-    own = _known_entries(
-        {key: value for key, value in ours.items() if key not in ("type", "stabilizer")},
-        MoGeConfig,
-        path,
-        "model_config",
-    )
+    own = _known_entries(own_entries(ours), MoGeConfig, path, "model_config")
     return {"type": ours["type"], "stabilizer": ours["stabilizer"], **own}
 
 

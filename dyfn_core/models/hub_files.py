@@ -40,7 +40,7 @@ _UNSUPPORTED = (
     (r"ruicheng/moge-3.*", "MoGe v3"),
     (r"ruicheng/.*", "another MoGe"),
 )
-WEIGHTS, CONFIG = "model.safetensors", "config.json"  # in repositories of save_pretrained
+WEIGHTS, CONFIG = "model.safetensors", "config.json"  # in repositories of models of this project
 LIBRARY = "dyfn_ros"  # in their config.json
 ANSWER = 4.0  # seconds that the Hub has to answer
 
@@ -92,7 +92,7 @@ def _refuse_by_name(repo: str) -> None:
 
 
 def _refuse_by_config(repo: str, path: Path) -> None:
-    """Raises CheckpointError unless config.json is one that save_pretrained wrote."""
+    """Raises CheckpointError unless config.json is that of a model of this project."""
     try:
         found: Any = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

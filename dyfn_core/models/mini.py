@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
 from dyfn_core.models.deterministic import (
     DeterministicConv2d,
     DeterministicGroupNorm,
@@ -206,7 +206,7 @@ class MiniModel(GeometryModel):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> MiniModel:
         """The model of a checkpoint's config; `type` and `stabilizer` are not for this class."""
-        fields = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
+        fields = own_entries(config)
         if "stage_channels" in fields:
             fields["stage_channels"] = tuple(fields["stage_channels"])
         return cls(MiniConfig(**fields))

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
 from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicGroupNorm, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.prediction import StreamState
@@ -187,8 +187,7 @@ class MoGeModel(GeometryModel):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> MoGeModel:
         """config: MoGeConfig's fields. ValueError for unknown or bad keys."""
-        own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
-        return cls(MoGeConfig.from_dict(own))
+        return cls(MoGeConfig.from_dict(own_entries(config)))
 
     @property
     def config(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
 from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.models.moge import REMAPS, remap_points
@@ -319,8 +319,7 @@ class MoGe2Model(GeometryModel):
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> MoGe2Model:
         """config: MoGe2Config's entries. ValueError for unknown or bad ones."""
-        own = {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
-        return cls(MoGe2Config.from_dict(own))
+        return cls(MoGe2Config.from_dict(own_entries(config)))
 
     @property
     def config(self) -> dict[str, Any]:
