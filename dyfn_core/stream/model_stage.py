@@ -112,8 +112,4 @@ class ModelStage(ScaleStage):
             problem = "the camera matrix is unknown, which this model needs for metres"
         self._unused[problem] += 1
         self.scale = ScaleInForce(self.source, problem=problem)
-        if self._options().until_metric != "withhold":
-            return prediction
-        return replace(
-            prediction, mask=np.zeros_like(prediction.mask), withheld=prediction.mask.copy()
-        )
+        return self._without_metres(prediction)

@@ -131,13 +131,6 @@ class MotionStage(ScaleStage):
             frame.visible,
         )
 
-    def _without_metres(self, prediction: Prediction[np.ndarray]) -> Prediction[np.ndarray]:
-        if self._options().until_metric != "withhold":
-            return prediction
-        return replace(
-            prediction, mask=np.zeros_like(prediction.mask), withheld=prediction.mask.copy()
-        )
-
     def _described(self, stamp: float, found: MotionScale) -> ScaleInForce:
         """What a user may know of the scale, and of the odometry."""
         problem = found.problem

@@ -5,9 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
 
 from dyfn_core.metric.references import Reference
 from dyfn_core.metric.scale import ScaleInForce
+from dyfn_core.prediction import Prediction
 from dyfn_core.stream.options import StreamOptions
 from dyfn_core.stream.stages import StreamStage
 
@@ -44,6 +48,14 @@ class ScaleStage(StreamStage, ABC):
     def _keeps(self) -> bool:
         """Whether a measured scale stays in force over a reset."""
         return self._options().after_reset == "keep"
+
+    def _without_metres(self, prediction: Prediction[np.ndarray]) -> Prediction[np.ndarray]:
+        """What is given while no metres are known: relative depth, or none."""
+        if self._options().until_metric != "withhold":
+            return prediction
+        return replace(
+            prediction, mask=np.zeros_like(prediction.mask), withheld=prediction.mask.copy()
+        )
 
     def problems(self) -> list[str]:
         """See StreamStage."""
