@@ -147,6 +147,16 @@ def count_topics(found: Iterable[Recorded]) -> dict[str, Topic]:
     return {topic: Topic(kind, counts[topic]) for topic, kind in kinds.items()}
 
 
+def topics_of(counted: Iterable[tuple[str, str, int]]) -> dict[str, Topic]:
+    """Topics by name, type and number of messages of their connections; of a topic with two types,
+    the first counts."""
+    topics: dict[str, Topic] = {}
+    for name, kind, count in counted:
+        known = topics.get(name, Topic(kind, 0))
+        topics[name] = Topic(known.kind, known.count + (count if known.kind == kind else 0))
+    return topics
+
+
 def reason(error: BaseException) -> str:
     """An exception as part of a sentence."""
     return f"{type(error).__name__} {error}".strip()

@@ -29,9 +29,9 @@ from dyfn_ros.recordings.storage.base import (
     MAX_BYTES,
     Losses,
     Recorded,
-    Topic,
     decompress,
     reason,
+    topics_of,
 )
 from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
 from dyfn_ros.recordings.storage.forms import Form, message_form
@@ -77,12 +77,11 @@ class McapFile(ChunkedFile):
         schemas = {channel.schema_id for channel in channels.values() if channel.schema_id}
         if len(chunks) != statistics[0].chunk_count or not schemas <= set(self._schemas):
             return None
-        topics: dict[str, Topic] = {}
-        for key, channel in channels.items():
-            form, counts = self._form(channel), statistics[0].channel_message_counts
-            known = topics.get(channel.topic, Topic(form.kind, 0))
-            count = counts.get(key, 0) if known.kind == form.kind else 0
-            topics[channel.topic] = Topic(known.kind, known.count + count)
+        counts = statistics[0].channel_message_counts
+        topics = topics_of(
+            (channel.topic, self._form(channel).kind, counts.get(key, 0))
+            for key, channel in channels.items()
+        )
         spans = self._spans(chunks)
         if spans is None:
             return None

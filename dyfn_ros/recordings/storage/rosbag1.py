@@ -23,6 +23,7 @@ from dyfn_ros.recordings.storage.base import (
     Topic,
     decompress,
     reason,
+    topics_of,
 )
 from dyfn_ros.recordings.storage.chunked import ChunkedFile, Index, Span, read_exactly
 from dyfn_ros.recordings.storage.forms import Form, ros1_form
@@ -64,12 +65,9 @@ class Bag1File(ChunkedFile):
         return Index(spans, {k: t for k, (t, _) in self._connections.items()}, self._topics(counts))
 
     def _topics(self, counts: Counter[int]) -> dict[str, Topic]:
-        topics: dict[str, Topic] = {}
-        for key, (topic, form) in self._connections.items():
-            known = topics.get(topic, Topic(form.kind, 0))
-            count = counts[key] if known.kind == form.kind else 0
-            topics[topic] = Topic(known.kind, known.count + count)
-        return topics
+        return topics_of(
+            (topic, form.kind, counts[key]) for key, (topic, form) in self._connections.items()
+        )
 
     def _record(self, file: BinaryIO) -> tuple[Header, bytes]:
         """Header and data at the file's position; raises one of DAMAGE."""

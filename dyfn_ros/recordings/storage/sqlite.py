@@ -15,6 +15,7 @@ from dyfn_ros.recordings.storage.base import (
     Topic,
     count_topics,
     reason,
+    topics_of,
 )
 from dyfn_ros.recordings.storage.forms import Form, ros2_form
 
@@ -73,12 +74,9 @@ class SqliteFile:
             )
         if not set(counts) <= set(topics):
             raise LookupError("messages of unknown topics")
-        found: dict[str, Topic] = {}
-        for key, (name, form) in topics.items():
-            known = found.get(name, Topic(form.kind, 0))
-            count = int(counts.get(key, 0)) if known.kind == form.kind else 0
-            found[name] = Topic(known.kind, known.count + count)
-        return found
+        return topics_of(
+            (name, form.kind, int(counts.get(key, 0))) for key, (name, form) in topics.items()
+        )
 
     def _open(self) -> sqlite3.Connection:
         """Read only. A write-ahead log beside the file is used when it can be."""
