@@ -11,13 +11,13 @@ import numpy as np
 from dyfn_core.evaluation.report.cloud_view import CloudView, PointCloud
 from dyfn_core.evaluation.report.curves import Curves
 from dyfn_core.evaluation.report.html import Section, Text, report_html
-from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.prediction import Prediction
 from dyfn_core.stream.options import StreamOptions
+from dyfn_ros.depth.outputs import solid
 from dyfn_ros.depth.run import ModelLoader, Outcome, Stop, run
 from dyfn_ros.depth.settings import VIDEO, Camera, DepthJob, Reading, Writing
 from dyfn_ros.depth.source import SourceFrame
-from dyfn_ros.replay.frame_spool import EDGE
+from dyfn_ros.depth.view import median_depth
 
 CLOUDS = 3  # evenly over the video
 DYFN, BASE = "DyFN", "base"
@@ -59,14 +59,12 @@ class Watched:
 
     def __call__(self, frame: SourceFrame, prediction: Prediction[np.ndarray]) -> None:
         """Take one frame."""
-        valid = prediction.valid
-        median = float(np.median(prediction.depth[valid])) if valid.any() else float("nan")
         if len(self.medians) % self._every == 0:
             self.shown.append((frame, prediction))
         if len(self.shown) > 2 * CLOUDS:
             self.shown, self._every = self.shown[::2], 2 * self._every
         self.seconds.append(frame.stamp)
-        self.medians.append(median)
+        self.medians.append(median_depth(prediction))
 
 
 def estimate(
@@ -145,8 +143,7 @@ def clouds_of(
     found: dict[str, PointCloud] = {}
     for place in sorted({0, len(shown) // 2, len(shown) - 1} & set(range(len(shown)))):
         frame, prediction = shown[place]
-        valid = prediction.valid
-        used = valid & ~flying_pixels(np.where(valid, prediction.depth, 1), valid, EDGE)
+        used = solid(prediction)
         if used.any():
             found[f"{frame.stamp:.1f} s"] = PointCloud(prediction.points[used], frame.image[used])
     return found

@@ -166,9 +166,7 @@ class DepthOutputs:
         return data.tobytes()
 
     def _cloud(self, path: Path, frame: SourceFrame, prediction: Prediction[np.ndarray]) -> None:
-        """Points without those that hang between two surfaces."""
-        valid = prediction.valid
-        used = valid & ~flying_pixels(np.where(valid, prediction.depth, 1), valid, EDGE)
+        used = solid(prediction)
         if not used.any():
             self.warnings["frames without a point have no PLY"] += 1
             return
@@ -187,6 +185,13 @@ class DepthOutputs:
         text = json.dumps({**facts, **unit, "frames": self._names}, indent=1, allow_nan=False)
         write_text(path, text + "\n")
         self.written.append(path)
+
+
+def solid(prediction: Prediction[np.ndarray]) -> np.ndarray:
+    """H x W bool: valid, and not between two surfaces, where points hang in the air."""
+    valid = prediction.valid
+    used: np.ndarray = valid & ~flying_pixels(np.where(valid, prediction.depth, 1), valid, EDGE)
+    return used
 
 
 def _check_libraries(kinds: tuple[str, ...], view: bool) -> None:

@@ -58,13 +58,18 @@ class _View:
 def scale_values(prediction: Prediction[np.ndarray]) -> dict[str, float]:
     """What tells a steady scale: the median depth, in metres where it is known."""
     values: dict[str, float] = {}
-    valid = prediction.valid
-    if valid.any():
-        name = "median_depth_m" if prediction.metric else "median_depth"
-        values[name] = float(np.median(prediction.depth[valid]))
+    median = median_depth(prediction)
+    if not math.isnan(median):
+        values["median_depth_m" if prediction.metric else "median_depth"] = median
     if prediction.metric and prediction.unit > 0:
         values["metres_per_unit"] = float(prediction.unit)
     return values
+
+
+def median_depth(prediction: Prediction[np.ndarray]) -> float:
+    """Of the valid pixels; NaN where there is none."""
+    valid = prediction.valid
+    return float(np.median(prediction.depth[valid])) if valid.any() else math.nan
 
 
 def _shrunk(
