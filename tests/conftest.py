@@ -12,6 +12,7 @@ import torch
 
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
+from tests.support.golden2 import Golden2
 from tests.support.pinhole import PinholeModel
 from tests.support.seeded import redraw
 
@@ -65,6 +66,15 @@ def golden_file(request: pytest.FixtureRequest) -> Callable[[str], Path]:
         return shared / "golden" / name
 
     return find
+
+
+@pytest.fixture(scope="session")
+def golden2(shared_dir: Path) -> Golden2:
+    """The golden files of MoGe v2 and Depth Anything 3."""
+    folder = shared_dir / "golden2"
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    return Golden2(folder)
 
 
 @pytest.fixture(scope="session")

@@ -10,13 +10,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 import yaml
 
 from dyfn_ros.recordings.rgbd_writer import write_rgbd_recording
-from tests.support.made_videos import make_video
+from tests.support.made_videos import make_video, panning
 from tests.support.rgbd_frames import rgbd
 from tests.test_docs import PAGES, ROOT, page_id
 
@@ -47,16 +46,10 @@ def pages_with(language: str) -> Any:
     return pytest.mark.parametrize("page", pages, ids=page_id)
 
 
-def picture(index: int, size: tuple[int, int]) -> np.ndarray:
-    blocks = np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8)
-    moved = np.roll(cv2.resize(blocks, size[::-1]), index, axis=1)
-    return np.ascontiguousarray(moved)
-
-
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where an example runs: with the files that the manual speaks of."""
-    make_video(tmp_path / "walk.mp4", [0, 0.1, 0.2, 0.3], size=(72, 96), picture=picture)
+    make_video(tmp_path / "walk.mp4", [0, 0.1, 0.2, 0.3], size=(72, 96), picture=panning)
     write_rgbd_recording(tmp_path / "made", rgbd(4))
     next((tmp_path / "made").glob("*.mcap")).rename(tmp_path / "recording.mcap")
     monkeypatch.chdir(tmp_path)
@@ -65,7 +58,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def names() -> dict[str, Any]:
     """What an example in Python takes for given."""
-    frames = [picture(index, (48, 64)) for index in range(2)]
+    frames = [panning(index, (48, 64)) for index in range(2)]
     return {
         "frames": frames,
         "image": frames[0],

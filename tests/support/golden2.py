@@ -64,3 +64,7 @@ class Golden2:
 def batch_of(*images: np.ndarray) -> Tensor:
     """B x 3 x H x W in 0..1."""
     return torch.stack([torch.from_numpy(i).permute(2, 0, 1).float() / 255 for i in images])
+
+
+def close(found: Tensor, wanted: np.ndarray, rtol: float = 0.0, atol: float = 1e-3) -> None:
+    torch.testing.assert_close(found, torch.from_numpy(wanted), rtol=rtol, atol=atol)

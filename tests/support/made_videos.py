@@ -8,6 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 
 TICKS = Fraction(1, 90_000)
@@ -16,6 +17,12 @@ TICKS = Fraction(1, 90_000)
 def grey(index: int, size: tuple[int, int]) -> np.ndarray:
     """20 x the index all over, from 0 again at 260."""
     return np.full((*size, 3), 20 * index % 260, np.uint8)
+
+
+def panning(index: int, size: tuple[int, int]) -> np.ndarray:
+    """One picture of blocks, a pixel further with each index."""
+    blocks = np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8)
+    return np.ascontiguousarray(np.roll(cv2.resize(blocks, size[::-1]), index, axis=1))
 
 
 def make_video(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from torch import Tensor
 
 from dyfn_core.models.checkpoints import CheckpointError, load_model, save_model
 from dyfn_core.models.depth_anything3 import (
@@ -20,37 +19,25 @@ from dyfn_core.models.depth_anything3 import (
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.stream.depth_stream import DepthStream
 from tests.support.bases import small_da3
-from tests.support.golden2 import Golden2, batch_of
+from tests.support.golden2 import Golden2, batch_of, close
 
 CASE = "f0_320x240_res252"
 
 
 @pytest.fixture(scope="module")
-def golden(shared_dir: Path) -> Golden2:
-    folder = shared_dir / "golden2"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
-    return Golden2(folder)
-
-
-@pytest.fixture(scope="module")
-def model(golden: Golden2) -> DepthAnything3Model:
+def model(golden2: Golden2) -> DepthAnything3Model:
     config = DepthAnything3Config("metric", encoder="dinov2_vits14", process_size=252)
     made = DepthAnything3Model(config).eval()
-    made.load_state_dict(golden.weights("da3mono_small"), assign=True)
+    made.load_state_dict(golden2.weights("da3mono_small"), assign=True)
     return made
-
-
-def close(found: Tensor, wanted: np.ndarray, rtol: float = 0.0, atol: float = 1e-3) -> None:
-    torch.testing.assert_close(found, torch.from_numpy(wanted), rtol=rtol, atol=atol)
 
 
 @pytest.mark.parametrize("case", [CASE, "f0_317x203_res252"])
 @torch.inference_mode()
 def test_network_matches_the_official_one(
-    golden: Golden2, model: DepthAnything3Model, case: str
+    golden2: Golden2, model: DepthAnything3Model, case: str
 ) -> None:
-    wanted = golden.arrays("da3mono_small", case)
+    wanted = golden2.arrays("da3mono_small", case)
     image = torch.from_numpy(wanted["network_input_u8"])
     size = (image.shape[1], image.shape[2])
     latent = model.encode_prepared(image, size)
@@ -74,10 +61,10 @@ def test_network_matches_the_official_one(
 @pytest.mark.parametrize(("case", "size"), [(CASE, (240, 320)), ("f0_317x203_res252", (203, 317))])
 @torch.inference_mode()
 def test_images_are_prepared_as_officially(
-    golden: Golden2, model: DepthAnything3Model, case: str, size: tuple[int, int]
+    golden2: Golden2, model: DepthAnything3Model, case: str, size: tuple[int, int]
 ) -> None:
-    wanted = golden.arrays("da3mono_small", case)
-    latent = model.encode(batch_of(golden.frame(0, size)))
+    wanted = golden2.arrays("da3mono_small", case)
+    latent = model.encode(batch_of(golden2.frame(0, size)))
     assert latent.network_size == tuple(wanted["network_hw"].tolist())
     exact = model.encode_prepared(torch.from_numpy(wanted["network_input_u8"]), size)
     # Another release of OpenCV may round a few pixels to the next of 256 levels.
@@ -85,10 +72,10 @@ def test_images_are_prepared_as_officially(
 
 
 def test_images_of_a_batch_do_not_share_their_sky(
-    golden: Golden2, model: DepthAnything3Model
+    golden2: Golden2, model: DepthAnything3Model
 ) -> None:
     """Officially one quantile for the batch; a stream must not depend on another camera."""
-    images = np.stack([golden.frame(0), golden.frame(4)])
+    images = np.stack([golden2.frame(0), golden2.frame(4)])
     together = model.infer(images, apply_mask=False)
     for index, image in enumerate(images):
         alone = model.infer(image, apply_mask=False)
@@ -96,8 +83,8 @@ def test_images_of_a_batch_do_not_share_their_sky(
 
 
 @pytest.mark.parametrize("name", ["da3mono_small", "da3mono_large"])
-def test_names_and_shapes_are_the_released_ones(golden: Golden2, name: str) -> None:
-    spec = golden.spec(name)
+def test_names_and_shapes_are_the_released_ones(golden2: Golden2, name: str) -> None:
+    spec = golden2.spec(name)
     encoder = {"da3mono_small": "dinov2_vits14", "da3mono_large": "dinov2_vitl14"}[name]
     with torch.device("meta"):
         made = DepthAnything3Model(DepthAnything3Config("mono", encoder=encoder))
@@ -107,20 +94,20 @@ def test_names_and_shapes_are_the_released_ones(golden: Golden2, name: str) -> N
 
 @pytest.mark.slow
 @torch.inference_mode()
-def test_released_shape_matches(golden: Golden2) -> None:
+def test_released_shape_matches(golden2: Golden2) -> None:
     if not os.environ.get("DYFN_LARGE"):
         pytest.skip("set DYFN_LARGE=1 to make 1.3 GB of weights (a minute)")
     made = DepthAnything3Model(DepthAnything3Config("mono", process_size=252)).eval()
-    made.load_state_dict(golden.weights("da3mono_large"), assign=True)
-    wanted = golden.arrays("da3mono_large", CASE)
+    made.load_state_dict(golden2.weights("da3mono_large"), assign=True)
+    wanted = golden2.arrays("da3mono_large", CASE)
     image = torch.from_numpy(wanted["network_input_u8"])
     affine = made.decode(made.encode_prepared(image, (image.shape[1], image.shape[2])))
     close(affine.depth[:, ::4, ::4], wanted["depth"], rtol=1e-4)
     close(0.3 - affine.mask[:, ::4, ::4], wanted["sky"])
 
 
-def test_official_file_is_read_by_what_its_config_says(golden: Golden2, tmp_path: Path) -> None:
-    weights = golden.da3_file("da3mono_small", tmp_path, {"model_name": "da3metric-large"})
+def test_official_file_is_read_by_what_its_config_says(golden2: Golden2, tmp_path: Path) -> None:
+    weights = golden2.da3_file("da3mono_small", tmp_path, {"model_name": "da3metric-large"})
     assert load_model(weights).config["kind"] == "metric"
     (tmp_path / "config.json").unlink()
     with pytest.raises(CheckpointError, match="says whether mono or metric"):

@@ -10,36 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dyfn_core.models.checkpoints import CheckpointError, load_model, save_model
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.moge2 import MoGe2Model, token_grid
 from tests.support.bases import moge2_config, small_moge2
-from tests.support.golden2 import Golden2, batch_of
+from tests.support.golden2 import Golden2, batch_of, close
 
 FULL = (240, 320)
 SMALL_STEPS, STEPS, SQUARE_STEPS = (3, 6, 10, 20, 20), (5, 10, 15, 20, 20), (8, 16, 32, 64, 64)
 
 
 @pytest.fixture(scope="module")
-def golden(shared_dir: Path) -> Golden2:
-    folder = shared_dir / "golden2"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
-    return Golden2(folder)
-
-
-@pytest.fixture(scope="module")
-def model(golden: Golden2, tmp_path_factory: pytest.TempPathFactory) -> MoGe2Model:
+def model(golden2: Golden2, tmp_path_factory: pytest.TempPathFactory) -> MoGe2Model:
     """The small golden model, read from a file in the official format."""
-    loaded = load_model(golden.moge_file("moge2_small", tmp_path_factory.mktemp("g") / "model.pt"))
+    loaded = load_model(golden2.moge_file("moge2_small", tmp_path_factory.mktemp("g") / "model.pt"))
     assert isinstance(loaded, MoGe2Model)
     return loaded
-
-
-def close(found: Tensor, wanted: np.ndarray, rtol: float = 0.0, atol: float = 1e-3) -> None:
-    torch.testing.assert_close(found, torch.from_numpy(wanted), rtol=rtol, atol=atol)
 
 
 def check_forward(
@@ -84,7 +71,7 @@ def check_forward(
 )
 @torch.inference_mode()
 def test_network_matches_the_official_one(
-    golden: Golden2,
+    golden2: Golden2,
     model: MoGe2Model,
     case: str,
     frame: int,
@@ -92,8 +79,8 @@ def test_network_matches_the_official_one(
     tokens: int,
     steps: tuple[int, ...],
 ) -> None:
-    wanted = golden.arrays("moge2_small_main", case)
-    check_forward(model, wanted, golden.frame(frame, size), tokens, steps)
+    wanted = golden2.arrays("moge2_small_main", case)
+    check_forward(model, wanted, golden2.frame(frame, size), tokens, steps)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +91,11 @@ def test_network_matches_the_official_one(
     ],
 )
 def test_infer_matches_the_official_one(
-    golden: Golden2, model: MoGe2Model, case: str, size: tuple[int, int]
+    golden2: Golden2, model: MoGe2Model, case: str, size: tuple[int, int]
 ) -> None:
     """Metres, normals and mask. The official solver stops early: its own shift is put back."""
-    wanted = golden.arrays("moge2_small_main", case)
-    found = model.infer(golden.frame(0, size), num_tokens=300)
+    wanted = golden2.arrays("moge2_small_main", case)
+    found = model.infer(golden2.frame(0, size), num_tokens=300)
     assert found.metric
     assert found.quantity == "depth"
     assert found.normal is not None
@@ -118,7 +105,7 @@ def test_infer_matches_the_official_one(
     packed = np.unpackbits(wanted["infer.mask"], axis=1)[:, : size[1]].astype(bool)
     assert (packed != found.mask.numpy()).mean() <= 1e-3
     with torch.inference_mode():
-        affine = model.decode(model.encode(batch_of(golden.frame(0, size)), 300))
+        affine = model.decode(model.encode(batch_of(golden2.frame(0, size)), 300))
     assert affine.metric_scale is not None
     moved = float(affine.metric_scale) * (float(wanted["infer.shift"][0]) - shift)
     depth = found.depth.numpy()[::4, ::4] + moved
@@ -130,12 +117,12 @@ def test_infer_matches_the_official_one(
 
 
 @torch.inference_mode()
-def test_known_field_of_view_leaves_the_shift(golden: Golden2, model: MoGe2Model) -> None:
-    wanted = golden.arrays("moge2_small_main", "f0_320x240_tok300.infer_fov60")
-    found = model.infer(golden.frame(0), num_tokens=300, fov_x=60.0)
+def test_known_field_of_view_leaves_the_shift(golden2: Golden2, model: MoGe2Model) -> None:
+    wanted = golden2.arrays("moge2_small_main", "f0_320x240_tok300.infer_fov60")
+    found = model.infer(golden2.frame(0), num_tokens=300, fov_x=60.0)
     np.testing.assert_allclose(found.intrinsics, wanted["intrinsics"], rtol=1e-5, atol=1e-6)
     _, shift = wanted["exact_focal_shift"][0]
-    affine = model.decode(model.encode(batch_of(golden.frame(0)), 300))
+    affine = model.decode(model.encode(batch_of(golden2.frame(0)), 300))
     assert affine.metric_scale is not None
     moved = float(affine.metric_scale) * (float(wanted["shift"][0]) - shift)
     depth = found.depth.numpy()[::4, ::4] + moved
@@ -143,17 +130,17 @@ def test_known_field_of_view_leaves_the_shift(golden: Golden2, model: MoGe2Model
     np.testing.assert_allclose(depth[both], wanted["depth"][both], rtol=1e-3)
 
 
-def test_a_batch_is_its_images(golden: Golden2, model: MoGe2Model) -> None:
-    images = np.stack([golden.frame(0), golden.frame(4)])
+def test_a_batch_is_its_images(golden2: Golden2, model: MoGe2Model) -> None:
+    images = np.stack([golden2.frame(0), golden2.frame(4)])
     together = model.infer(images, num_tokens=60)
     for index, image in enumerate(images):
         torch.testing.assert_close(model.infer(image, num_tokens=60).depth, together.depth[index])
 
 
 @torch.inference_mode()
-def test_latent_reaches_points_but_not_metres(golden: Golden2, model: MoGe2Model) -> None:
-    latent = model.encode(batch_of(golden.frame(0)), 300)
-    wanted = golden.arrays("moge2_small_main", "f0_320x240_tok300.latent_times_2")
+def test_latent_reaches_points_but_not_metres(golden2: Golden2, model: MoGe2Model) -> None:
+    latent = model.encode(batch_of(golden2.frame(0)), 300)
+    wanted = golden2.arrays("moge2_small_main", "f0_320x240_tok300.latent_times_2")
     found = model.decode(replace(latent, features=2 * latent.features))
     close(found.points[0, ::8, ::8], wanted["forward.points"], rtol=1e-4, atol=1e-5)
     assert found.metric_scale is not None
@@ -164,8 +151,8 @@ def test_latent_reaches_points_but_not_metres(golden: Golden2, model: MoGe2Model
     "name",
     ["moge2_small", "moge2_vits_normal", "moge2_vitb_normal", "moge2_vitl_normal", "moge2_vitl"],
 )
-def test_names_and_shapes_are_the_released_ones(golden: Golden2, name: str) -> None:
-    spec = golden.spec(name)
+def test_names_and_shapes_are_the_released_ones(golden2: Golden2, name: str) -> None:
+    spec = golden2.spec(name)
     with torch.device("meta"):
         made = MoGe2Model.from_config(spec["model_config"])
     found = {key: list(value.shape) for key, value in made.state_dict().items()}
@@ -176,13 +163,13 @@ def test_names_and_shapes_are_the_released_ones(golden: Golden2, name: str) -> N
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["moge2_vits_normal", "moge2_vitb_normal", "moge2_vitl_normal"])
 @torch.inference_mode()
-def test_released_shapes_match(golden: Golden2, name: str) -> None:
+def test_released_shapes_match(golden2: Golden2, name: str) -> None:
     if name != "moge2_vits_normal" and not os.environ.get("DYFN_LARGE"):
         pytest.skip("set DYFN_LARGE=1 to make up to 1.3 GB of weights (a minute each)")
-    made = MoGe2Model.from_config(golden.spec(name)["model_config"]).eval()
-    made.load_state_dict(golden.weights(name), assign=True)
-    wanted = golden.arrays(f"{name}_main", "f0_320x240_tok300")
-    check_forward(made, wanted, golden.frame(0), 300, STEPS)
+    made = MoGe2Model.from_config(golden2.spec(name)["model_config"]).eval()
+    made.load_state_dict(golden2.weights(name), assign=True)
+    wanted = golden2.arrays(f"{name}_main", "f0_320x240_tok300")
+    check_forward(made, wanted, golden2.frame(0), 300, STEPS)
 
 
 # Without the golden files.

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 
 from tests.support.browser import NAMES
-from tests.support.made_videos import make_video
+from tests.support.made_videos import make_video, panning
 from tests.support.tiny_model import load_tiny
 
 gradio = pytest.importorskip("gradio", reason="the extra `app` is not installed")
@@ -24,18 +23,13 @@ from dyfn_ros.app.options import parser  # noqa: E402
 WEBGL = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
 
 
-def picture(index: int, size: tuple[int, int]) -> np.ndarray:
-    blocks = np.random.default_rng(1).integers(0, 255, (6, 8, 3), np.uint8)
-    return np.ascontiguousarray(np.roll(cv2.resize(blocks, size[::-1]), index, axis=1))
-
-
 def tiny(name: str, device: str) -> Any:
     return load_tiny()
 
 
 @pytest.fixture
 def walk(tmp_path: Path) -> Path:
-    return make_video(tmp_path / "walk.mp4", [0, 0.1, 0.2, 0.3], picture=picture)
+    return make_video(tmp_path / "walk.mp4", [0, 0.1, 0.2, 0.3], picture=panning)
 
 
 def free_port() -> int:
