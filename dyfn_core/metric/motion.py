@@ -403,8 +403,8 @@ def measure_scale(
     values, sigma = ratios[good], points.sigma[good]
     weights = 1 / (sigma**2 + _FLOOR**2)
     weights /= np.sqrt(_crowding(points.pixels[good], weights, size))
-    centre = _weighted_median(values, weights)
-    spread = 1.4826 * _weighted_median(np.abs(values - centre), weights)
+    centre = weighted_median(values, weights)
+    spread = 1.4826 * weighted_median(np.abs(values - centre), weights)
     if spread > options.most_spread:
         return None
     noise = _LEAST_NOISE**2 + float(np.median(sigma)) ** 2 + spread**2 / (count / _NEIGHBOURS)
@@ -419,7 +419,8 @@ def _crowding(pixels: np.ndarray, weights: np.ndarray, size: tuple[int, int]) ->
     return np.asarray(np.bincount(cell, weights, _CELLS[0] * _CELLS[1])[cell])
 
 
-def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """The value with half of the weight below it, of N values and N positive weights."""
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(total, total[-1] / 2)])

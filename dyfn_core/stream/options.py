@@ -121,6 +121,12 @@ class StreamOptions:
         range=(0.0, 3600.0),
         live=True,
     )
+    scale_memory: bool = option(
+        STREAM,
+        False,
+        "Steady the scale of the depth by key points that the pictures show again; not with "
+        "metric_source odometry or model, which have their own. See docs/metric_scale.md.",
+    )
     state_file: str = option(
         STREAM,
         "",
@@ -242,6 +248,11 @@ class StreamOptions:
         for name, described in options_of(StreamOptions).items():
             if problem := described.problem(name, getattr(self, name)):
                 raise ValueError(problem)
+        if self.scale_memory and self.metric_source in ("odometry", "model"):
+            raise ValueError(
+                f"scale_memory is True, expected False with metric_source {self.metric_source!r}, "
+                "which finds the scale of every frame itself"
+            )
         near, far = self.reference_depths
         if near >= far:
             raise ValueError(

@@ -121,6 +121,8 @@ class StateKeeper:
             saved = load_stream(_checked(path), self.fingerprint)
             if saved.memory.image_size is None:
                 raise StateError("the state has no frames in it")
+            if saved.scale_memory is not None and not options.scale_memory:
+                raise StateError(f"{path} was saved with scale_memory, this stream has none")
             frame_id = saved.notes.get("frame_id", "")
             settings = StreamSettings(options.stabilize, options.num_tokens, frame_id)
             self._check_camera(path, saved, settings)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dyfn_core.prediction import AFFINE_DEPTH, DISPARITY, Frame, Prediction
+from dyfn_core.prediction import AFFINE_DEPTH, DEPTH, DISPARITY, Frame, Prediction
 from dyfn_core.stream.depth_stream import DepthStream, same_camera
 from dyfn_core.stream.metric_stage import MetricStage
 from dyfn_core.stream.model_stage import ModelStage
@@ -26,6 +26,7 @@ from dyfn_core.stream.resets import (
     REQUESTED,
 )
 from dyfn_core.stream.saving import Loaded, StateKeeper, StreamSettings
+from dyfn_core.stream.scale_memory_stage import ScaleMemoryStage
 from dyfn_core.stream.scale_stage import ScaleStage
 from dyfn_core.stream.scene_cut_stage import Place, SceneCutStage
 from dyfn_core.stream.stages import StreamStage
@@ -50,7 +51,8 @@ class StreamSession:
     A frame passes, in this order: a state that was loaded takes the stream's place; the rules
     decide whether the stream must be reset (a failed frame, a request, another frame_id, stamps,
     image size, camera matrix, settings, then the stages: scene cuts); the network and DyFN; the
-    stages again, in their order: pictures that show nothing, metres, and what the caller adds.
+    stages again, in their order: pictures that show nothing, the memory of scale, metres, and what
+    the caller adds.
     The first rule that applies gives the reason of a reset. A reset ends the memory of the stream
     and of its stages.
 
@@ -59,8 +61,8 @@ class StreamSession:
 
     Attributes:
         model: The network, shared by any number of sessions.
-        stages: Scene cuts, unusable pictures, metric scale, and those that were given, in this
-            order.
+        stages: Scene cuts, unusable pictures, the memory of scale (option scale_memory), metric
+            scale, and those that were given, in this order.
         resets: How often the stream was reset, by reason (see dyfn_core.stream.resets).
         last_reset: The last reset as a line of a log; "" before the first.
         stream: What holds the memory; None before the first frame and after a failed one.
@@ -108,7 +110,14 @@ class StreamSession:
             lambda: self._options.scene_cut_threshold, lambda frame: self._place(frame)
         )
         self._pictures = PictureStage(lambda: self._options)
-        self.stages: tuple[StreamStage, ...] = (cuts, self._pictures, self._metric, *stages)
+        memory = (ScaleMemoryStage(),) if options.scale_memory else ()
+        self.stages: tuple[StreamStage, ...] = (
+            cuts,
+            self._pictures,
+            *memory,
+            self._metric,
+            *stages,
+        )
         self.resets: Counter[str] = Counter()
         self.last_reset = ""
         self._place: Place = _as_it_is
@@ -416,7 +425,7 @@ class StreamSession:
 
 
 def check_metres(model: GeometryModel, options: StreamOptions) -> None:
-    """Raises ValueError when metric_source is not for what the model predicts."""
+    """Raises ValueError when metric_source or scale_memory is not for what the model predicts."""
     source = options.metric_source
     if source == ModelStage.source and not model.knows_metres:
         raise ValueError(
@@ -434,6 +443,11 @@ def check_metres(model: GeometryModel, options: StreamOptions) -> None:
             f"metric_source is {source!r}, but the model's depth has an unknown shift, which a "
             "scale alone does not undo; expected 'none', or 'reference' with calibration_fit "
             "'scale_shift'"
+        )
+    if options.scale_memory and model.quantity != DEPTH:
+        raise ValueError(
+            f"scale_memory is True, but the model predicts {model.quantity}, whose unknown shift "
+            "no factor undoes; expected False"
         )
 
 

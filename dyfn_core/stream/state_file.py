@@ -20,6 +20,7 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from dyfn_core.files import finished_file
+from dyfn_core.geometry.key_points import KeyPoints
 from dyfn_core.geometry.tracks import TrackerState, Tracks
 from dyfn_core.metric.calibration import ScaleCalibration, ScalePrior
 from dyfn_core.metric.fit import MetricMap
@@ -28,6 +29,7 @@ from dyfn_core.metric.motion_scale import MotionScaleState
 from dyfn_core.metric.point_memory import PointMemory
 from dyfn_core.metric.references import Evidence
 from dyfn_core.metric.scale_filter import FilterState
+from dyfn_core.metric.scale_memory import ScaleMemoryState, SeenFrame
 from dyfn_core.prediction import StreamState
 from dyfn_core.stream.depth_stream import DepthStream, MeanState, StreamMemory
 from dyfn_core.stream.plain_values import from_plain, to_plain
@@ -47,7 +49,8 @@ class SavedStream:
 
     memory: the DepthStream's. camera_matrix: 3 x 3 float64 pixels, or None.
     calibration: of the metric scale; cut: of the scene cut detector; motion: of the scale from the
-    camera's motion; model_scale: of the scale that the model says; None when there is none.
+    camera's motion; model_scale: of the scale that the model says; scale_memory: of the scale from
+    the pictures; None when there is none.
     options: what the stream was made with. notes: the caller's own, text to text.
     """
 
@@ -59,6 +62,7 @@ class SavedStream:
     options: dict[str, Any] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
     model_scale: FilterState | None = None
+    scale_memory: ScaleMemoryState | None = None
 
 
 # The names are a part of the format: a class that is renamed keeps the name that files have.
@@ -80,6 +84,9 @@ _KINDS: dict[str, type] = {
     "Tracks": Tracks,
     "PointMemory": PointMemory,
     "FilterState": FilterState,
+    "ScaleMemoryState": ScaleMemoryState,
+    "SeenFrame": SeenFrame,
+    "KeyPoints": KeyPoints,
 }
 
 
@@ -104,6 +111,7 @@ def save_stream(
     cut: CutState | None = None,
     motion: MotionScaleState | None = None,
     model_scale: FilterState | None = None,
+    scale_memory: ScaleMemoryState | None = None,
     notes: Mapping[str, str] | None = None,
 ) -> None:
     """Write a stream's state, whole or not at all: an older file stays until then.
@@ -120,6 +128,7 @@ def save_stream(
         stream_options(stream),
         dict(notes or {}),
         model_scale,
+        scale_memory,
     )
     tensors: dict[str, Tensor] = {}
     content = json.dumps(

@@ -132,7 +132,8 @@ class Session:
         command = [str(recording), "--out", str(out), "--write", "raw", "--device", "cpu"]
         command += ["--threads", "1", "--depth-topic", "none", *more]
         for name, value in {"model": "tiny", "scene_cut_threshold": 0.0, **self.options}.items():
-            command += [f"--{name.replace('_', '-')}", str(value)]
+            flag = f"--{name.replace('_', '-')}"
+            command += [flag] if value is True else [flag, str(value)]
         assert main(command, load) == ALL
         with (out / "output.mcap").open("rb") as file:
             found = make_reader(file).iter_messages(
@@ -313,6 +314,15 @@ def plane_walk(bench: Session, count: int) -> tuple[list[Message], list[Message]
             pose = between(poses[index], near, abs(rest)) @ inverse(MOUNT)
             bodies.append(odometry(pose, 10 + index + rest))
     return images(list(range(11, 11 + count)), pictures), bodies
+
+
+def test_scale_memory(session: Callable[..., Session]) -> None:
+    bench = session(model="pinhole", scale_memory=True)
+    pictures, _ = plane_walk(bench, 8)
+    live = bench.live(pictures)
+    offline, metrics = bench.replay(pictures)
+    assert live == offline
+    assert metrics["options"]["scale_memory"] is True
 
 
 @pytest.mark.parametrize("by_parameter", [False, True])
