@@ -14,7 +14,7 @@ import torch
 import yaml
 
 from dyfn_core.argument_types import at_least_one, finite
-from dyfn_core.cli import experiments
+from dyfn_core.cli import adapt, experiments
 from dyfn_core.cli.arguments import (
     Commands,
     add_out,
@@ -77,6 +77,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.command == "experiments":
             experiments.run(options)
             return 0
+        if options.command == "adapt":
+            return adapt.run(options)
         if options.command == "curve":
             _curve(options)
             return 0
@@ -255,6 +257,7 @@ def parser() -> argparse.ArgumentParser:
     }
     for name, purpose in purposes.items():
         _add_training(commands, name, purpose)
+    adapt.add_parser(commands)
     experiments.add_parser(commands)
     _add_curve(commands)
     _add_average(commands)

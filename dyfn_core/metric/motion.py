@@ -401,14 +401,29 @@ def measure_scale(
     if count < options.fewest:
         return None
     values, sigma = ratios[good], points.sigma[good]
-    weights = 1 / (sigma**2 + _FLOOR**2)
-    weights /= np.sqrt(_crowding(points.pixels[good], weights, size))
+    weights = point_weights(points.pixels[good], sigma, size)
     centre = weighted_median(values, weights)
     spread = 1.4826 * weighted_median(np.abs(values - centre), weights)
     if spread > options.most_spread:
         return None
     noise = _LEAST_NOISE**2 + float(np.median(sigma)) ** 2 + spread**2 / (count / _NEIGHBOURS)
     return ScaleMeasurement(centre, noise, count, spread)
+
+
+def point_weights(pixels: np.ndarray, sigma: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """How much each point says about a predicted depth, whose shape is wrong as well.
+
+    Args:
+        pixels: N x 2, (x, y) in the picture.
+        sigma: N, standard deviations of log depth.
+        size: (H, W) of the picture.
+
+    Returns:
+        N, positive: 1 / (variance of point and shape), less where points crowd.
+    """
+    weights = 1 / (sigma**2 + _FLOOR**2)
+    weights /= np.sqrt(_crowding(pixels, weights, size))
+    return np.asarray(weights)
 
 
 def _crowding(pixels: np.ndarray, weights: np.ndarray, size: tuple[int, int]) -> np.ndarray:

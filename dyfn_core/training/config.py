@@ -26,7 +26,7 @@ from dyfn_core.data.rendered import SPLITS
 from dyfn_core.models.mini import MiniConfig
 from dyfn_core.training.config_errors import check_fields, describe
 
-Settings = TypeVar("Settings", bound="RunConfig")
+Settings = TypeVar("Settings", bound="LoopConfig")
 
 # What config files were called before -> what they are called.
 FORMER_NAMES = {
@@ -107,15 +107,14 @@ class DataConfig(BaseModel):
         return DataSpec(self.root, self.kind, self.weight, self.split, self.cuts, options)
 
 
-class RunConfig(Strict):
-    """What every run has: data, schedule, bookkeeping.
+class LoopConfig(Strict):
+    """What the loop of every run needs: schedule, optimizer, bookkeeping.
 
     Attributes:
-        data: Roots of data sets, or mappings with their root, kind and weight (DataConfig).
-        kinds: Kinds of rendered folders.
-        stages: Sizes of batches and images, from a step on.
         steps: Length of the schedule.
         hours: The schedule ends no later than after this much training time, whatever the step.
+        patience: The run ends after that many validations in a row without a new best; default:
+            it goes on.
         seed: Of all random draws.
         threads: Threads of a process.
         device: "auto" takes the GPU that accelerate gives this process, if any.
@@ -129,20 +128,15 @@ class RunConfig(Strict):
         ema_decay: Of the moving average of the parameters, which is what a run exports.
         most_bad_steps: Steps in a row that may be skipped for a loss or gradient that is not
             finite.
-        augment_strength: Of the changes of colour, blur and noise; 0 is none, 1 the full range.
-        smallest_view: Smallest side of a crop, relative to the largest that fits into the view.
         checkpoint_minutes: Time between checkpoints.
         log_every: Steps between lines of the log.
         picture_every: Steps between pictures.
         validate_every: Steps between validations.
-        validation_rgbd: A recording with rgb/, depth/ and K.txt to validate on too.
     """
 
-    data: tuple[DataConfig, ...] = Field(min_length=1)
-    kinds: tuple[str, ...] = ("frames", "clip")
-    stages: tuple[StageConfig, ...] = Field(min_length=1)
     steps: int = Field(ge=1)
     hours: float | None = Field(None, gt=0)
+    patience: int | None = Field(None, ge=1)
     seed: int = 0
     threads: int = Field(2, ge=1)
     device: Literal["auto", "cpu"] = "auto"
@@ -154,12 +148,29 @@ class RunConfig(Strict):
     clip_norm: float = Field(1.0, gt=0)
     ema_decay: float = Field(0.999, ge=0, lt=1)
     most_bad_steps: int = Field(20, ge=0)
-    augment_strength: float = Field(1.0, ge=0, le=1)
-    smallest_view: float = Field(0.5, gt=0, le=1)
     checkpoint_minutes: float = Field(4.0, gt=0)
     log_every: int = Field(20, ge=1)
     picture_every: int = Field(500, ge=1)
     validate_every: int = Field(1000, ge=1)
+
+
+class RunConfig(LoopConfig):
+    """A run on data sets.
+
+    Attributes:
+        data: Roots of data sets, or mappings with their root, kind and weight (DataConfig).
+        kinds: Kinds of rendered folders.
+        stages: Sizes of batches and images, from a step on.
+        augment_strength: Of the changes of colour, blur and noise; 0 is none, 1 the full range.
+        smallest_view: Smallest side of a crop, relative to the largest that fits into the view.
+        validation_rgbd: A recording with rgb/, depth/ and K.txt to validate on too.
+    """
+
+    data: tuple[DataConfig, ...] = Field(min_length=1)
+    kinds: tuple[str, ...] = ("frames", "clip")
+    stages: tuple[StageConfig, ...] = Field(min_length=1)
+    augment_strength: float = Field(1.0, ge=0, le=1)
+    smallest_view: float = Field(0.5, gt=0, le=1)
     validation_rgbd: Path | None = None
 
     @field_validator("stages")

@@ -1,7 +1,8 @@
-"""A ROS recording with a depth topic as training data: the data kind `recording`.
+"""A ROS recording as training data: the data kind `recording`.
 
 A recording can only be read from its start, and clips are drawn at random. So its frames are
-written once to a folder of pictures, which later runs find again.
+written once to a folder of pictures, which later runs find again. With poses it is read in the
+order of time, and nothing is written.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import os
 import shutil
 from collections import Counter
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +32,11 @@ from dyfn_core.data.frames import (
     RgbdFrame,
     camera_intrinsics,
 )
+from dyfn_core.data.posed import PosedFrame, PosedRecording
+from dyfn_core.metric.pose_history import SECOND
+from dyfn_ros.messages.odometry_options import ODOMETRY, OdometryOptions
 from dyfn_ros.recordings.open import RecordedFrame, RecordingError, open_recording
+from dyfn_ros.recordings.poses import PoseTopic
 from dyfn_ros.recordings.storage.open import is_recording, open_storage
 from dyfn_ros.recordings.topics import listed_topics
 
@@ -206,4 +212,65 @@ def _write_frame(
     return [float(value) for value in camera]
 
 
-RECORDING = DataKind("recording", open_recording_kind, EXPECTED, is_recording)
+def open_posed_recording(
+    root: Path,
+    *,
+    image_topic: str | None = None,
+    camera_info_topic: str | None = None,
+    depth_topic: str | None = None,
+    tolerance: float = 0.02,
+    odometry_topic: str | None = None,
+    odometry_type: str = ODOMETRY,
+    odom_frame: str = OdometryOptions.odom_frame,
+    moving_frame: str = "",
+    camera_pose: str = "",
+) -> list[PosedRecording]:
+    """A recording with odometry, with or without depth.
+
+    Args:
+        root: The recording.
+        image_topic: Found by type when there is one candidate, as the two next ones.
+        camera_info_topic: Of the image topic.
+        depth_topic: Registered to the colour image.
+        tolerance: Seconds between the stamps of an image and its depth.
+        odometry_topic: Found by type, see recordings.poses.PoseTopic.
+        odometry_type: One of OdometryOptions.odometry_type, as the next ones.
+        odom_frame: For TF.
+        moving_frame: Whose pose the odometry is; "": the message's.
+        camera_pose: In the moving frame; "": by /tf and /tf_static.
+
+    Raises:
+        DataError: It cannot be opened, or has no poses.
+    """
+    frames = OdometryOptions(odometry_type, odom_frame, moving_frame, camera_pose)
+    try:
+        recording = open_recording(root, image_topic, camera_info_topic, depth_topic, tolerance)
+        PoseTopic(root, frames, odometry_topic)  # says what is wrong before anything is read
+    except (RecordingError, ValueError) as error:
+        raise DataError(str(error)) from error
+    problems: Counter[str] = Counter()
+
+    def read() -> Iterator[PosedFrame]:
+        poses = PoseTopic(root, frames, odometry_topic)
+        for frame in recording.frames():
+            if frame.camera_matrix is None:
+                problems["image without usable CameraInfo"] += 1
+                continue
+            placed = poses.at(frame.stamp_ns, frame.frame_id, frame.source.log_ns)
+            yield PosedFrame(
+                frame.image,
+                frame.stamp_ns / SECOND,
+                frame.camera_matrix,
+                None if placed is None else placed.pose,
+                None if placed is None else placed.variance,
+                frame.depth,
+                frame.visible,
+            )
+        notes = (recording.notes.losses, recording.notes.warnings, poses.losses)
+        for found in (*notes, poses.poses.lines()):
+            problems.update(found)
+
+    return [PosedRecording(str(root), recording.expected_frames, read, problems)]
+
+
+RECORDING = DataKind("recording", open_recording_kind, EXPECTED, is_recording, open_posed_recording)

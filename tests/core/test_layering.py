@@ -26,6 +26,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "losses": _WORDS | {"geometry"},
         "stream": _MODELS | {"metric"},
         "training": _MODELS | {"losses", "data", "scoring"},
+        "adaptation": _MODELS | {"metric", "scoring", "data", "stream", "losses", "training"},
         "evaluation": _MODELS | {"metric", "scoring", "data", "stream"},
         "experiments": _MODELS
         | {"metric", "scoring", "data", "stream", "losses", "training", "evaluation"},

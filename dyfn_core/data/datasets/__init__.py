@@ -27,6 +27,7 @@ from dyfn_core.data.datasets import (
 )
 from dyfn_core.data.files import nothing_found
 from dyfn_core.data.frames import DataError, DataReport, FrameSequence
+from dyfn_core.data.posed import PosedRecording, posed_folders
 
 ENTRY_POINTS = "dyfn_core.data_kinds"
 RENDERED = "rendered"
@@ -39,22 +40,30 @@ class DataKind:
 
     open: (root, report, **options) -> the sequences, having counted in the report what cannot be
     used; its keyword-only parameters are the kind's options. expected: the layout, for messages.
-    recognises: whether a path is of this kind without being told; None: it must be told.
+    recognises: whether a path is of this kind without being told; None: it must be told. posed:
+    (root, **options) -> the same as recordings with poses, in the order of time, with options of
+    its own; None for kinds that are none.
     """
 
     name: str
     open: Callable[..., list[FrameSequence]]
     expected: str
     recognises: Callable[[Path], bool] | None = None
+    posed: Callable[..., list[PosedRecording]] | None = None
 
     def options(self) -> dict[str, Any]:
         """Name -> (type, default) of each option."""
-        hints = get_type_hints(self.open)
-        return {
-            name: (hints[name], parameter.default)
-            for name, parameter in inspect.signature(self.open).parameters.items()
-            if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-        }
+        return options_of(self.open)
+
+
+def options_of(opener: Callable[..., Any]) -> dict[str, Any]:
+    """Name -> (type, default) of the keyword-only parameters of a function."""
+    hints = get_type_hints(opener)
+    return {
+        name: (hints[name], parameter.default)
+        for name, parameter in inspect.signature(opener).parameters.items()
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+    }
 
 
 BUILT_IN = (
@@ -70,6 +79,7 @@ BUILT_IN = (
         rgbd_folder.open_rgbd_folder,
         rgbd_folder.EXPECTED,
         rgbd_folder.is_rgbd_folder,
+        posed_folders,
     ),
 )
 
@@ -140,3 +150,30 @@ def open_kind(
             raise DataError(f"{report.summary()}; expected {kind.expected}")
         raise nothing_found(root, kind.expected)
     return sequences, report
+
+
+def open_posed(root: Path, name: str, options: dict[str, Any]) -> list[PosedRecording]:
+    """Recordings with poses below root.
+
+    Args:
+        root: A recording or a folder.
+        name: The kind, or AUTO.
+        options: Of the kind's `posed`.
+
+    Raises:
+        DataError: The kind has no poses, or has no such option; or nothing of it is there.
+    """
+    kind = recognise(root) if name == AUTO else name
+    opener = None if kind == RENDERED else data_kind(kind).posed
+    if opener is None:
+        fit = [one.name for one in data_kinds().values() if isinstance(one, DataKind) and one.posed]
+        raise DataError(
+            f"{root}: {kind} is no recording with poses; expected one of {', '.join(fit)}"
+        )
+    known = options_of(opener)
+    if unknown := sorted(options.keys() - known.keys()):
+        raise DataError(f"{root}: {kind} has no option {unknown[0]!r}, only {sorted(known)}")
+    found = opener(root, **options)
+    if not found:
+        raise nothing_found(root, data_kind(kind).expected)
+    return found

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from dyfn_core.training.config import ConfigError, RunConfig
+from dyfn_core.training.config import ConfigError, LoopConfig
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -47,7 +47,7 @@ class Processes:
     Raises ConfigError when the parts of a batch cannot be shared out equally.
     """
 
-    def __init__(self, config: RunConfig) -> None:
+    def __init__(self, config: LoopConfig) -> None:
         # Importing it takes seconds, which commands that train nothing need not pay.
         from accelerate import Accelerator
         from accelerate.utils import InitProcessGroupKwargs

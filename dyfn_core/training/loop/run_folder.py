@@ -18,7 +18,7 @@ import yaml
 from torch.utils.tensorboard import SummaryWriter
 
 from dyfn_core.files import write_text
-from dyfn_core.training.config import RunConfig
+from dyfn_core.training.config import LoopConfig
 
 CONFIG_FILE = "config.yaml"
 VERSIONS_FILE = "versions.json"
@@ -43,7 +43,7 @@ class RunFolder:
     its last checkpoint; they will be written anew and are dropped.
     """
 
-    def __init__(self, folder: Path, config: RunConfig, step: int, facts: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, config: LoopConfig, step: int, facts: dict[str, Any]) -> None:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         (folder / RESULTS_FILE).unlink(missing_ok=True)

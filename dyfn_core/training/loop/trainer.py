@@ -12,7 +12,7 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dyfn_core.models.checkpoints import save_model
-from dyfn_core.training.config import RunConfig
+from dyfn_core.training.config import LoopConfig
 from dyfn_core.training.former_config import former_command, translated
 from dyfn_core.training.loop.checkpoint import (
     STATE_FILE,
@@ -36,7 +36,7 @@ from dyfn_core.training.tasks.task import Task
 MODEL_FILE = "model.safetensors"
 BEST_FILE = "best.safetensors"
 MOST_TOLD = 10  # messages about clips that could not be read, at the end of a run
-COUNTERS = ("step", "seconds", "images", "best", "bad_steps", "skipped_steps")
+COUNTERS = ("step", "seconds", "images", "best", "stale", "bad_steps", "skipped_steps")
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ class Trainer:
     def __init__(
         self,
         task: Task,
-        config: RunConfig,
+        config: LoopConfig,
         out: Path,
         resume: bool,
         processes: Processes | None = None,
@@ -88,7 +88,8 @@ class Trainer:
         self.module = self.processes.wrap(task.model, task.loss)
         self.stepper = self.processes.accelerator.prepare(self.optimizer)
         self.step, self.images, self.bad_steps, self.skipped_steps = 0, 0, 0, 0
-        self.seconds, self.best = 0.0, math.inf
+        self.seconds, self.best, self.stale = 0.0, math.inf, 0
+        self._validated = -1  # step of the last validation of this process
         self.scores: dict[str, float] = {}
         check_folder(out, resume)
         if resume:
@@ -128,7 +129,8 @@ class Trainer:
                 f"{name}: checkpoint written at step {self.step}; go on with --resume",
                 signals.number or 15,
             )
-        self._validate()
+        if self._validated != self.step:
+            self._validate()
         self.save()
         if self.folder is not None and self.progress() >= 1:
             self.folder.results(self._summary())
@@ -167,7 +169,10 @@ class Trainer:
         return False
 
     def progress(self) -> float:
-        """Share of the schedule that is over, by steps or by time, whichever is further."""
+        """Share of the schedule that is over, by steps or by time, whichever is further; 1 when
+        nothing has got better for as long as `patience` says."""
+        if self.config.patience is not None and self.stale >= self.config.patience:
+            return 1.0
         share = self.step / self.config.steps
         if self.config.hours is not None:
             share = max(share, self.seconds / (3600 * self.config.hours))
@@ -224,12 +229,16 @@ class Trainer:
             with self.ema.applied(), torch.no_grad():
                 self.task.model.eval()
                 self.scores = self.task.validate()
-                if self.scores.get("score", math.inf) < self.best:
+                better = self.scores.get("score", math.inf) < self.best
+                if better:
                     self.best = self.scores["score"]
                     self._export(self.out / BEST_FILE)
                 self.task.model.train()
+            self.stale = 0 if better else self.stale + 1
             self._log("validation", self.scores)
+        self._validated = self.step
         self.processes.wait()
+        self.stale = int(self.processes.agree(True, False, float(self.stale))[2])  # main's
 
     def _show(self, batch: Any) -> None:
         if self.folder is not None:
@@ -297,7 +306,8 @@ class Trainer:
 
     def _tell_changes(self, before: dict[str, Any]) -> None:
         now = self.config.model_dump(mode="json")
-        if (former := former_command(before)) is not None:
+        former = former_command(before) if "method" in type(self.config).model_fields else None
+        if former is not None:
             before = (
                 type(self.config)
                 .model_validate(translated(before, former, tell=False))

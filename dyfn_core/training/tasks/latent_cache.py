@@ -208,9 +208,15 @@ def _sub_clip(
 
 def fingerprint(model: GeometryModel, source: ClipSource) -> dict[str, Any]:
     """What a cache depends on: the frozen parameters, and where its clips come from."""
+    described = {key: value for key, value in asdict(source).items() if key != "relist_seconds"}
+    described = json.loads(json.dumps(described, default=str))
+    return {"model": base_digest(model), "source": described}
+
+
+def base_digest(model: GeometryModel) -> str:
+    """SHA-256 of all parameters but DyFN's."""
     digest = hashlib.sha256()
     for name, value in model.state_dict().items():
         if not name.startswith("stabilizer."):
             digest.update(value.detach().cpu().float().contiguous().numpy().tobytes())
-    described = {key: value for key, value in asdict(source).items() if key != "relist_seconds"}
-    return {"model": digest.hexdigest(), "source": json.loads(json.dumps(described, default=str))}
+    return digest.hexdigest()

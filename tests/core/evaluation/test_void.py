@@ -33,8 +33,7 @@ from tests.support.made_benchmarks import (
     write_uint16,
 )
 from tests.support.pinhole import PinholeModel
-from tests.support.plane_drive import OWN_CAMERA
-from tests.support.textured_plane import plane_view, texture, walk
+from tests.support.textured_plane import CAMERA, plane_view, texture, walk
 
 UNIT = 2.0  # metres in one unit of the pinhole model
 
@@ -165,8 +164,8 @@ def test_metres_by_triangulation_with_the_poses() -> None:
     """Also without stamps; nothing is in metres before the odometry has agreed for a while."""
     stream, whole, found = MetresStream(POSES, "plane"), texture(), []
     for index, camera_pose in enumerate(walk(44, step=0.02, turn=0.002)):
-        view = plane_view(camera_pose, whole, OWN_CAMERA)
-        frame = BenchmarkFrame(view.image, view.depth, OWN_CAMERA, camera_pose)
+        view = plane_view(camera_pose, whole, CAMERA)
+        frame = BenchmarkFrame(view.image, view.depth, CAMERA, camera_pose)
         metres = stream.push(index, frame, view.depth / np.float32(UNIT))
         found.append(np.abs(metres / view.depth - 1))
     assert np.isnan(found[0]).all()

@@ -81,3 +81,16 @@ def test_unknown_depth_and_empty_clips_count_for_nothing() -> None:
     nothing = video_protocol_loss(prediction, torch.full_like(truth, torch.nan))
     (gradient,) = torch.autograd.grad(nothing, prediction)
     assert float(nothing) == 0 and not gradient.any()
+
+
+def test_a_weight_counts_as_so_many_samples_and_zero_as_none() -> None:
+    prediction, truth = clips(3)
+    weights = torch.ones_like(truth)
+    weights[:, :, ::2] = 2.0
+    twice = [torch.cat([part, part[:, :, ::2]], 2) for part in (prediction, truth)]
+    found = float(video_protocol_loss(prediction, truth, weights))
+    assert found == pytest.approx(float(video_protocol_loss(*twice)), rel=1e-9)
+    weights[:, :, ::2] = 0.0
+    half = [part[:, :, 1::2] for part in (prediction, truth)]
+    found = float(video_protocol_loss(prediction, truth, weights))
+    assert found == pytest.approx(float(video_protocol_loss(*half)), rel=1e-9)

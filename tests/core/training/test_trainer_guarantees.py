@@ -301,3 +301,21 @@ def test_signal_before_the_loop_is_over_is_an_interrupted_run(tmp_path: Path) ->
         trainer.train()
     assert signal.getsignal(signal.SIGTERM) is before
     assert read_state(tmp_path / "run")["step"] == 4
+
+
+def test_patience_ends_a_run_in_which_nothing_gets_better(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best of the scores is the second; two more validations end it, also after a resume."""
+    scores = iter([3.0, 2.0, 2.5, 2.0, 1.0])
+    monkeypatch.setattr(ToyTask, "validate", lambda self: {"score": next(scores)})
+    changes: dict[str, Any] = {"steps": 100, "validate_every": 3, "patience": 2}
+    config = toy_config(**changes)
+    first = Trainer(ToyTask(), config, tmp_path / "run", resume=False)
+    first.train(max_steps=8)  # which validates at 3, 6, and 8
+    assert (first.step, first.stale) == (8, 1)
+    assert not (tmp_path / "run" / "results.json").exists()
+    trainer = run_toy(tmp_path / "run", resume=True, **changes)
+    assert (trainer.step, trainer.best, trainer.stale) == (9, 2.0, 2)
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    assert (results["step"], results["best"]) == (9, 2.0)

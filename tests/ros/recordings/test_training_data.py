@@ -15,12 +15,16 @@ import yaml
 
 from dyfn_core.cli.train import main
 from dyfn_core.data import datasets
-from dyfn_core.data.datasets import data_kind, open_kind
+from dyfn_core.data.datasets import data_kind, open_kind, open_posed
 from dyfn_core.data.frames import DataError
 from dyfn_core.data.pool import DataSpec, open_pool
 from dyfn_core.models.checkpoints import load_model
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, compressed_message
 from dyfn_ros.recordings.writer import RecordingWriter
+from tests.support.odometry import MOUNT, pose_text
+from tests.support.plane_drive import OWN_CAMERA, drive
+from tests.support.textured_plane import SIZE as PLANE_SIZE
+from tests.support.textured_plane import pose_at
 
 SIZE = (48, 64)
 CAMERA = np.array([[50.0, 0, 30.5], [0, 52.0, 24.5], [0, 0, 1]])
@@ -273,3 +277,61 @@ def test_recording_named_in_a_config_with_options(
     assert (
         "'depth_topik' of kind 'recording', did you mean 'depth_topic'" in capsys.readouterr().err
     )
+
+
+def walked(tmp_path: Path, frames: int = 6) -> tuple[Path, list[np.ndarray]]:
+    """A folder of flat pictures, and the camera's poses in it.
+
+    The base goes straight on and turns, each at one speed, so that a pose between two others is
+    exactly the interpolated one.
+    """
+    folder = tmp_path / "walk"
+    bases = [pose_at((0.04 * i, 0.01 * i, 0), (0, 0, 0.03 * i)) for i in range(frames)]
+    poses = [base @ MOUNT for base in bases]
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    np.savetxt(folder / "K.txt", OWN_CAMERA)
+    np.savetxt(folder / "poses.txt", np.stack(poses).reshape(-1, 16))
+    for index in range(frames):
+        cv2.imwrite(
+            str(folder / f"rgb/{index}.png"), np.full((*PLANE_SIZE, 3), 9 * index, np.uint8)
+        )
+        depth = np.full(PLANE_SIZE, 1000 + index, np.uint16)
+        cv2.imwrite(str(folder / f"depth/{index}.png"), depth)
+    return folder, poses
+
+
+def test_a_bag_with_odometry_gives_the_cameras_poses_in_order(tmp_path: Path) -> None:
+    """The base's odometry comes between the images; its growth and the depth come along."""
+    folder, poses = walked(tmp_path)
+    bag, place = drive(folder, tmp_path / "bag" / "drive.mcap"), {"camera_pose": pose_text(MOUNT)}
+    (recording,) = open_posed(bag, "auto", place)
+    frames = list(recording.frames())
+    assert recording.expected == len(frames) == len(poses)
+    for found, pose in zip(frames[1:-1], poses[1:-1], strict=True):  # odometry on either side
+        np.testing.assert_allclose(found.pose, pose, atol=1e-9)
+    for index, frame in enumerate(frames):
+        assert frame.image[0, 0, 0] == 9 * index and frame.depth is not None
+        assert frame.depth[0, 0] == pytest.approx(1 + index / 1000)
+        np.testing.assert_allclose(frame.camera_matrix, OWN_CAMERA)
+    assert np.diff([frame.stamp for frame in frames]) == pytest.approx(0.1)
+    (unplaced,) = open_posed(bag, "auto", {})
+    assert all(frame.pose is None for frame in unplaced.frames())
+    assert any("'base_link'" in text and "camera_pose" in text for text in unplaced.problems)
+
+
+def test_a_bag_without_usable_odometry_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    folder, _ = walked(tmp_path)
+    bag = drive(folder, tmp_path / "bag" / "drive.mcap")
+    with pytest.raises(DataError, match=r"no topic /nothing of poses, odometry or TF"):
+        open_posed(bag, "recording", {"odometry_topic": "/nothing"})
+    with pytest.raises(DataError, match="camera_pose"):
+        open_posed(bag, "recording", {"camera_pose": "1 2 3"})
+    with pytest.raises(DataError, match="recording has no option 'odometry'"):
+        open_posed(bag, "recording", {"odometry": "/odom"})
+    plain = tmp_path / "plain.mcap"
+    with RecordingWriter(plain) as writer:
+        writer.write_png("/camera/image", picture(0), 10**9, "camera")
+        writer.write_camera_info("/camera/camera_info", CAMERA, SIZE, 10**9, "camera")
+    with pytest.raises(DataError, match="expected a topic of poses, odometry or TF"):
+        open_posed(plain, "auto", {})

@@ -1,0 +1,140 @@
+"""dyfn-train adapt: a model learns from its user's recordings with odometry, without true depth."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from dyfn_core.adaptation.config import DECODER, AdaptConfig
+from dyfn_core.adaptation.run import AdaptResult, Compared, adapt
+from dyfn_core.argument_types import above_zero, at_least_one
+from dyfn_core.cli.arguments import Commands, add_model, add_out, described
+from dyfn_core.evaluation.report.html import Cell, Table, text_table
+from dyfn_core.evaluation.report.tables import write_tables
+from dyfn_core.training.config import override, settings_of
+
+NOT_BETTER = 1
+HEADER = (
+    *("recording", "part", "frames", "truth", "image AbsRel before", "adapted"),
+    *("video AbsRel before", "adapted"),
+)
+# Options that are settings of AdaptConfig.
+SETTINGS = ("decoder", "rate", "hold_back", "test", "steps", "seed")
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the sub-command."""
+    purpose = "adapt a model to recordings with odometry, by triangulated points"
+    command = commands.add_parser(
+        "adapt",
+        help=purpose,
+        description=described(purpose),
+        epilog="Exit status: 0, the model was written; 1, it has not become better, and was not, "
+        "or something is wrong.",
+    )
+    command.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="[KIND=]RECORDING",
+        help="bag, MCAP file or RGB-D folder with poses; with options: "
+        "'{root: PATH, odometry_topic: /odom}'",
+    )
+    add_out(command, "file of the model, NAME.safetensors").metavar = "FILE"
+    add_model(command)
+    _add_learning(command.add_argument_group("what learns"))
+    group = command.add_argument_group("run")
+    group.add_argument(
+        "--run", type=Path, metavar="DIR", help="folder of the run (default: NAME.run beside FILE)"
+    )
+    group.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
+    )
+
+
+def _add_learning(group: argparse._ArgumentGroup) -> None:
+    default = {name: AdaptConfig.model_fields[name].default for name in SETTINGS}
+    add = group.add_argument
+    add(
+        "--decoder",
+        choices=DECODER,
+        help=f"part of the decoder that learns beside DyFN (default: {default['decoder']})",
+    )
+    add(
+        "--rate",
+        type=above_zero,
+        metavar="HZ",
+        help=f"frames a second that are learned from (default: {default['rate']:g})",
+    )
+    add(
+        "--hold-back",
+        type=float,
+        metavar="SHARE",
+        help="of each 20 s, which decides when to stop and whether the model is better "
+        f"(default: {default['hold_back']:g})",
+    )
+    add(
+        "--test",
+        type=float,
+        metavar="SHARE",
+        help="at the end of each recording, which is scored and decides nothing "
+        f"(default: {default['test']:g})",
+    )
+    add(
+        "--steps",
+        type=at_least_one,
+        metavar="N",
+        help=f"at most so many (default: {default['steps']})",
+    )
+    add("--seed", type=int, metavar="N", help=f"of all draws (default: {default['seed']})")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Adapt, print the table; returns the exit status. Raises as adaptation.run.adapt does."""
+    values: dict[str, Any] = {"recordings": options.recordings, "base": options.model}
+    given = ((name, getattr(options, name)) for name in SETTINGS)
+    values |= {name: value for name, value in given if value is not None}
+    for text in options.set:
+        override(values, text)
+    config = settings_of(values, AdaptConfig, Path("dyfn-train adapt"))
+    folder = options.run or options.out.with_suffix(".run")
+    result = adapt(config, options.out, folder, options.resume)
+    return 0 if result is None else _tell(result, config, options.out, folder)
+
+
+def _tell(result: AdaptResult, config: AdaptConfig, out: Path, folder: Path) -> int:
+    table = comparison_table(result.rows)
+    write_tables(folder, "table", table, f"{config.base} before and after")
+    for text, count in result.problems.items():
+        print(f"dyfn-train: not used: {count} x {text}", file=sys.stderr)
+    print(text_table(table))
+    change = f"{result.before:.4f} to {result.after:.4f}"
+    if result.better:
+        print(f"held-back points, one alignment: AbsRel {change} in {result.steps} steps: {out}")
+        print("which is a --model for dyfn-replay, dyfn-eval and the node")
+        return 0
+    print(
+        f"dyfn-train: no model was written: on the held-back points {config.base} is as good or "
+        f"better (AbsRel {change}, {result.steps} steps)",
+        file=sys.stderr,
+    )
+    return NOT_BETTER
+
+
+def comparison_table(rows: list[Compared]) -> Table:
+    """A row for each part and truth: both models under the image and video protocols."""
+    cells: list[list[Cell]] = []
+    for row in rows:
+        name, before, after = Path(row.recording).name, row.before, row.after
+        shared: list[Cell] = [name, row.part, row.frames]
+        image = (before.points_image, after.points_image)
+        video = (before.points_video, after.points_video)
+        cells.append([*shared, "points", *image, *video])
+        if before.truth is not None and after.truth is not None:
+            sensor = (before.truth, after.truth)
+            pairs = [score.image_abs_rel for score in sensor]
+            pairs += [score.video_abs_rel for score in sensor]
+            cells.append([*shared, "depth sensor", *pairs])
+    return Table(HEADER, cells)
