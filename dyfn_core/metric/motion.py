@@ -20,6 +20,8 @@ _TURN = math.radians(0.1), 0.02  # odometry's own noise: radians, and share of t
 _STEP = 1e-3, 0.01  # metres, and share of the translation
 _TRUST = 0.25  # of the usual variances, which an odometry's own account may go down to
 _SHARED = 0.6  # of the latest view's tracks; with fewer left, the picture becomes a view
+_AROUND = 0.02  # of the picture's longer side, within which the predicted surfaces may be a point's
+_EITHER = 0.5  # of their range of log depth, which a point's sigma grows by
 _RIGID = 1e-3  # most that a pose's rotation may miss an orthonormal matrix by
 
 
@@ -373,13 +375,43 @@ def log_ratios(points: MotionPoints, depth: np.ndarray, valid: np.ndarray) -> np
     Returns:
         N float64, NaN without a prediction.
     """
-    height, width = depth.shape
-    columns = np.clip(np.rint(points.pixels[:, 0]).astype(int), 0, width - 1)
-    rows = np.clip(np.rint(points.pixels[:, 1]).astype(int), 0, height - 1)
+    rows, columns = _places(points.pixels, depth.shape)
     predicted = np.where(valid[rows, columns], depth[rows, columns], np.nan).astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.log(points.depth / predicted)
     return np.where(np.isfinite(ratio), ratio, np.nan)
+
+
+def _places(pixels: np.ndarray, size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels that places (..., x and y) are in."""
+    columns = np.clip(np.rint(pixels[..., 0]).astype(int), 0, size[1] - 1)
+    rows = np.clip(np.rint(pixels[..., 1]).astype(int), 0, size[0] - 1)
+    return rows, columns
+
+
+def surface_doubt(pixels: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """How uncertain it is which predicted surface a point lies on.
+
+    The prediction blurs and misplaces the edges of things, and most corners that can be tracked lie
+    there: compared with the surface behind it, a point on an edge would bend that one forward.
+
+    Args:
+        pixels: N x 2, (x, y).
+        depth: H x W predicted depth.
+        valid: H x W bool.
+
+    Returns:
+        N, standard deviations of log depth; 0 where the prediction is flat or missing.
+    """
+    height, width = depth.shape
+    steps = np.linspace(-_AROUND, _AROUND, 5) * max(height, width)
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    rows, columns = _places(pixels[:, None] + offsets, depth.shape)
+    known = valid[rows, columns] & (depth[rows, columns] > 0)
+    logs = np.log(np.where(known, depth[rows, columns], 1.0), dtype=np.float64)
+    far = np.where(known, logs, -np.inf).max(axis=1)
+    near = np.where(known, logs, np.inf).min(axis=1)
+    return np.asarray(_EITHER * np.maximum(far - near, 0.0))
 
 
 def measure_scale(

@@ -20,6 +20,7 @@ from dyfn_core.metric.motion import (
     log_ratios,
     measure_scale,
     observe,
+    surface_doubt,
 )
 from dyfn_core.metric.point_memory import (
     MemoryOptions,
@@ -68,7 +69,7 @@ class MotionScaleOptions:
     field_sigma_pixels: float = 0.2
     doubt_seconds: float = 5.0
     doubt: float = 0.25
-    shape_doubt: float = 0.5
+    shape_doubt: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,8 @@ def step(
     if state.scale is not None:
         kept = unhidden(ratios - state.scale.log_scale, seen, options.memory)
         points, ratios = chosen(points, kept), ratios[kept]
+    doubt = surface_doubt(points.pixels, frame.depth, frame.valid)
+    points = replace(points, sigma=np.hypot(points.sigma, doubt))
     measured = measure_scale(points, ratios, frame.depth.shape, options.motion)
     scale = _filtered(state.scale, measured, frame.stamp, options.scale)
     unit = scale.log_scale if state.unit is None and scale is not None else state.unit

@@ -16,6 +16,7 @@ from dyfn_core.metric.motion import (
     measure_scale,
     observe,
     step_variance,
+    surface_doubt,
 )
 from tests.support.textured_plane import CAMERA, PlaneView, plane_view, pose_at, texture, walk
 
@@ -114,6 +115,17 @@ def test_ratio_is_unknown_without_a_prediction() -> None:
     depth = np.array([[2.0, 4.0, 0.0]])
     found = log_ratios(points, depth, np.array([[True, False, True]]))
     np.testing.assert_allclose(found, [-math.log(2), np.nan, np.nan])
+
+
+def test_point_at_an_edge_of_the_prediction_is_doubtful() -> None:
+    """Left 1 m, right 2 m, a hole below: half of their distance in log depth, near the edge."""
+    depth, valid = np.ones((100, 100), np.float32), np.ones((100, 100), bool)
+    depth[:, 50:], valid[60:] = 2.0, False
+    pixels = np.array([[20, 20], [48.6, 20], [51, 20], [53, 20], [20, 59], [20, 80]])
+    edge = 0.5 * math.log(2)
+    doubt = surface_doubt(pixels, depth, valid)
+    np.testing.assert_allclose(doubt, [0, edge, edge, 0, 0, 0])
+    assert surface_doubt(np.empty((0, 2)), depth, valid).shape == (0,)
 
 
 STILL = [pose_at((0, 0, 0), (0, 0, 0))] * 6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dyfn_core.geometry.tracks import TrackOptions
-from dyfn_core.metric.motion import MotionOptions
+from dyfn_core.metric.motion import MotionOptions, MotionPoints
 from dyfn_core.metric.motion_scale import (
     MotionFrame,
     MotionScale,
@@ -122,6 +122,28 @@ def test_field_mends_the_shape(walked: list[MotionFrame]) -> None:
         errors.append(np.abs(metres(found[-1], bent[-1].depth) / truth(walked[-1]) - 1).mean())
     assert errors[0] < 0.5 * errors[1]
     assert errors[1] > 0.08
+
+
+@pytest.mark.parametrize("rim", ["true", "in the prediction"])
+def test_points_on_a_rim_do_not_bend_the_wall_behind(rim: str) -> None:
+    """A box at 1 m before a wall at 2 m: the predicted box is smaller than the true one."""
+    true, predicted = (np.full((120, 160), 2.0, np.float32) for _ in range(2))
+    true[30:90, 40:120], predicted[32:88, 42:118] = 1.0, 1.0
+    rows, columns = np.divmod(np.arange(30 * 40, 90 * 160, 37), 160)
+    edge = np.array([[x, y] for y in (30.5, 89) for x in range(40, 120, 2)], float)
+    pixels = np.concatenate([np.column_stack([columns, rows]), edge])
+    depth = true[np.rint(pixels[:, 1]).astype(int), np.rint(pixels[:, 0]).astype(int)]
+    sigma = np.full(len(pixels), 0.02)
+    points = MotionPoints(
+        np.arange(len(pixels)), pixels, depth.astype(np.float64), sigma, sigma, rms=0.3
+    )
+    image, valid = np.zeros((120, 160, 3), np.uint8), np.ones((120, 160), bool)
+    shown = true if rim == "true" else predicted
+    frame = MotionFrame(image, 0.0, CAMERA, None, shown, valid, points=points)
+    _, found = run([replace(frame, stamp=float(i)) for i in range(8)])
+    wall = (true == 2.0) & (shown == 2.0)
+    wall[24:96, 34:126] = False
+    np.testing.assert_allclose(metres(found[-1], shown)[wall], 2.0, rtol=0.1)
 
 
 def test_remembered_points_count(walked: list[MotionFrame]) -> None:
