@@ -71,12 +71,14 @@ def test_every_stream_parameter_of_the_node_is_an_option_with_its_default() -> N
 
 
 def test_every_option_reaches_the_session() -> None:
-    other = {bool: "--no-", int: "7", float: "0.125", str: "x"}
+    other = {int: "7", float: "0.125", str: "x"}
     for name, described in options_of(SessionOptions).items():
         value = getattr(SessionOptions(), name)
-        text = described.choices[-1] if described.choices else other[type(value)]
         flag = f"--{name.replace('_', '-')}"
-        words = [flag.replace("--", "--no-")] if value is True else [flag, text]
+        if isinstance(value, bool):
+            words = [flag.replace("--", "--no-") if value else flag]
+        else:
+            words = [flag, described.choices[-1] if described.choices else other[type(value)]]
         if name == "state_file":
             words.append("--load-state")
         found = parse(["walk", "--out", "out", *words]).job.run
