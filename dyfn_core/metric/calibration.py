@@ -57,15 +57,16 @@ class CalibrationOptions:
 
 @dataclass(frozen=True)
 class ScalePrior:
-    """The scale of before a reset of the stream; a value.
+    """A scale that was in force, until there is another; a value.
 
     map: it was in force. spread: relative standard deviation, grown with each reset.
-    points: pairs behind its last agreeing fit.
+    points: pairs behind its last agreeing fit. before: what ended it.
     """
 
     map: MetricMap
     spread: float
     points: int
+    before: str = "a reset"
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,15 @@ class ScaleCalibrator:
             self.state = ScaleCalibration(prior=replace(prior, spread=grown))
         else:
             self.state = ScaleCalibration()
+
+    def begin_anew(self) -> None:
+        """Measure again in the same unit; what is known stays in force until that has worked."""
+        state = self.state
+        prior = state.prior
+        if state.map is not None:
+            asked = "the calibration that was asked for"
+            prior = ScalePrior(state.map, state.spread, state.points, asked)
+        self.state = ScaleCalibration(prior=prior)
 
     def push(self, evidence: Evidence) -> None:
         """One measurement. One without pairs moves nothing.

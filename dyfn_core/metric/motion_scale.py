@@ -130,10 +130,16 @@ class MotionScaleState:
 
         Tracks and points end; the unit stays. Stamps may go on at any time.
         """
-        scale = None if self.scale is None else restarted(self.scale, options.scale)
+        scale = self.less_certain(options).scale
         return MotionScaleState(
             scale=scale, unit=self.unit, contradicted=self.contradicted, measured=self.measured
         )
+
+    def less_certain(self, options: MotionScaleOptions) -> MotionScaleState:
+        """The scale counts for less, so that the next measurements decide; all else stays."""
+        if self.scale is None:
+            return self
+        return replace(self, scale=restarted(self.scale, options.scale))
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class ScaleInForce:
     age: seconds since a measurement last agreed with it (0 for a fixed one, NaN unknown).
     points: pairs behind the last agreeing fit. disagrees: the measurements contradict it.
     problem: why there is none, or what speaks against it; "" if all is well. kept: the scale is
-    of before a reset of the stream, and nothing has been measured since.
+    of before a reset of the stream or a calibration, and nothing has been measured since.
     """
 
     source: str
@@ -164,7 +164,7 @@ def _kept(source: str, prior: ScalePrior, problem: str) -> ScaleInForce:
         prior.map,
         prior.spread,
         points=prior.points,
-        problem=f"kept from before a reset: {reason}",
+        problem=f"kept from before {prior.before}: {reason}",
         kept=True,
     )
 

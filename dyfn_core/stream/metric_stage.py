@@ -85,6 +85,11 @@ class MetricStage(ScaleStage):
         return 1.0 if self.scale.metric else None
 
     @property
+    def measures(self) -> bool:
+        """See ScaleStage."""
+        return self._metric.options.source in ("reference", "camera_height")
+
+    @property
     def state(self) -> ScaleCalibration:
         """See StreamStage."""
         return self._metric.calibrator.state
@@ -114,6 +119,9 @@ class MetricStage(ScaleStage):
         options, stamp = self._options(), frame.stamp or 0.0
         if options.metric_scale != self._metric.options.metric_scale:
             self._metric.options = replace(self._metric.options, metric_scale=options.metric_scale)
+        if self._anew:
+            self._anew = False
+            self._metric.calibrator.begin_anew()
         measured = self._measured(frame, prediction)
         self.scale = scale = self._metric.push(prediction, stamp, measured)
         if scale.map is None:

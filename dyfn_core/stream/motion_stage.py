@@ -97,6 +97,9 @@ class MotionStage(ScaleStage):
             self.scale = replace(self.scale, map=None, problem="the camera matrix is unknown")
             self._unused[self.scale.problem] += 1
             return self._without_metres(prediction)
+        if self._anew:
+            self._anew = False
+            self._state = self._state.less_certain(self._how)
         self._state, found = step(self._state, self._frame(frame, prediction), self._how)
         if found.measured is not None:
             self._kept = ""

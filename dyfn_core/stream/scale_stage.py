@@ -29,6 +29,16 @@ class ScaleStage(StreamStage, ABC):
     def __init__(self, options: Callable[[], StreamOptions]) -> None:
         """options: Asked for at each frame; only the live ones may change."""
         self._options = options
+        self._anew = False  # a calibration was asked for since the last frame
+
+    @property
+    def measures(self) -> bool:
+        """Whether its scale comes from measurements."""
+        return True
+
+    def request_calibration(self) -> None:
+        """Measure the scale anew from the next frame on; any thread."""
+        self._anew = True
 
     @property
     @abstractmethod

@@ -192,6 +192,28 @@ class StreamSession:
             self.asked = ResetRequest(self.asked.count + 1, reason)
             return self.asked
 
+    def request_calibration(self) -> str:
+        """Measure the metric scale anew, in the same unit, from the next frame on.
+
+        What is in force stays so until that has worked.
+
+        Returns:
+            A line that says what is awaited.
+
+        Raises:
+            ValueError: The source of metres measures nothing.
+        """
+        options = self._options
+        if not self._metric.measures:
+            raise ValueError(
+                f"metric_source is {options.metric_source!r}, which measures nothing: there is no "
+                "scale to calibrate"
+            )
+        self._metric.request_calibration()
+        known = self.scale.map
+        former = "" if known is None else f"; until then {known.scale:.4g} stays in force"
+        return f"the scale is measured anew, by {options.metric_source}{former}"
+
     def save(self, path: str | None = None) -> str:
         """Write the state after the last frame to a file; an older file is kept when that fails.
 

@@ -9,8 +9,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from dyfn_core.evaluation.report.colours import colour_depth, depth_range
 from dyfn_core.evaluation.report.frame_grid import depth_bar, draw_bars
-from dyfn_core.evaluation.report.pictures import colour_depth, depth_range
 from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.protocols import sample_grid
 

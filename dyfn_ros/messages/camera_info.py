@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -105,6 +106,36 @@ def lens_model(name: str) -> str:
 def _field(info: Any, name: str) -> Any:
     """ROS 2 says k and p, ROS 1 recordings say K and P."""
     return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
+
+
+def resized_matrix(matrix: np.ndarray, scale: tuple[float, float]) -> np.ndarray:
+    """3 x 3 or 3 x 4 camera matrix of the same view in other pixels.
+
+    scale: new width over old width, and the same of the heights. A pixel's centre c, counted from
+    the first one's, is at s (c + 1/2) - 1/2.
+    """
+    found = np.array(matrix, np.float64)
+    for row, factor in enumerate(scale):
+        found[row] *= factor
+        found[row, 2] += (factor - 1) / 2
+    return found
+
+
+def resized_camera_info(info: Any, height: int, width: int) -> Any:
+    """A sensor_msgs.msg.CameraInfo for an image of the same view with other pixels.
+
+    Its binning and region of interest are worked into K and P, whose P[3] is in pixels too.
+    """
+    x, y, w, h = _window(info)
+    scale = (width / w, height / h)
+    found = copy.copy(info)
+    found.roi = type(info.roi)()
+    found.height, found.width, found.binning_x, found.binning_y = height, width, 0, 0
+    for name, columns in (("k", 3), ("p", 4)):
+        matrix = np.array(_field(info, name), np.float64).reshape(3, columns)
+        matrix[:2, 2] -= (x, y)
+        setattr(found, name, resized_matrix(matrix, scale).reshape(-1))
+    return found
 
 
 def camera_info_message(header: Any, matrix: np.ndarray, height: int, width: int) -> Any:

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 
-from dyfn_ros.messages.encodings import COLOUR_ENCODINGS, MessageError, Raster, decode_colour
+from dyfn_ros.messages.encodings import (
+    COLOUR_ENCODINGS,
+    FULL_BITS,
+    MessageError,
+    Raster,
+    decode_colour,
+    quoted,
+    to_uint8,
+)
+from dyfn_ros.messages.jpeg_complaints import harmless, with_complaints
 from dyfn_ros.messages.picture_size import JPEG, MAX_PIXELS, PNG, check_picture_size
 
 _LAYOUT = re.compile(
@@ -40,11 +50,19 @@ def parse_format(text: str) -> Layout:
     )
 
 
-def decode_compressed(message: Any, most: int = MAX_PIXELS) -> np.ndarray:
+def decode_compressed(
+    message: Any,
+    most: int = MAX_PIXELS,
+    bits: int = FULL_BITS,
+    damaged: Callable[[str], None] = lambda text: None,
+) -> np.ndarray:
     """sensor_msgs/CompressedImage with JPEG or PNG -> H x W x 3 uint8 RGB.
 
     What the data is decides on the codec. `format` decides on what a file cannot say: whether a
     grey one is a Bayer mosaic, and whether the codec was given RGB where files have BGR.
+
+    bits: of the values of 16-bit files, see decode_colour. damaged: told what is wrong with a JPEG
+    whose picture is whole all the same.
     Raises MessageError for other codecs, depth transports, incomplete or broken files, and more
     pixels than `most`.
     """
@@ -55,21 +73,39 @@ def decode_compressed(message: Any, most: int = MAX_PIXELS) -> np.ndarray:
     layout = parse_format(text)
     mosaic = layout.encoding.startswith("bayer_") and layout.order in ("", layout.encoding)
     try:
-        kind = cv2.IMREAD_UNCHANGED if mosaic else cv2.IMREAD_COLOR
-        image = cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
+        image, complaints = _decoded(data, mosaic, bits, content.startswith(JPEG))
     except cv2.error as error:
         raise MessageError(f"the compressed image cannot be decoded: {error}") from error
     if image is None or image.size == 0:
-        raise MessageError(f"the compressed image (format {text!r}) cannot be decoded")
+        raise MessageError(f"the compressed image (format {quoted(text)}) cannot be decoded")
+    for complaint in complaints:
+        if not harmless(complaint):
+            raise MessageError(f"the JPEG is damaged: {complaint}")
+        damaged(f"the JPEG is damaged, but whole: {complaint}")
     if mosaic:
-        return _demosaiced(image, layout, text)
+        return _demosaiced(image, layout, text, bits)
+    image = to_uint8(image, bits)
     # What the codec was given as RGB comes back as RGB, in the places of BGR.
     if layout.order.startswith("rgb"):
         return np.ascontiguousarray(image)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _demosaiced(image: np.ndarray, layout: Layout, text: str) -> np.ndarray:
+def _decoded(
+    data: np.ndarray, mosaic: bool, bits: int, jpeg: bool
+) -> tuple[np.ndarray | None, list[str]]:
+    """-> as cv2.imdecode, and what libjpeg complains of."""
+    kind = cv2.IMREAD_UNCHANGED if mosaic else cv2.IMREAD_COLOR
+    if bits != FULL_BITS:
+        kind |= cv2.IMREAD_ANYDEPTH
+
+    def decode() -> np.ndarray | None:
+        return cv2.imdecode(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
+
+    return with_complaints(decode) if jpeg else (decode(), [])
+
+
+def _demosaiced(image: np.ndarray, layout: Layout, text: str, significant: int) -> np.ndarray:
     bits = 8 * image.itemsize
     if (
         image.ndim != 2
@@ -77,14 +113,19 @@ def _demosaiced(image: np.ndarray, layout: Layout, text: str) -> np.ndarray:
         or f"{bits}" != layout.encoding[10:]
     ):
         raise MessageError(
-            f"format {text!r} needs a grey picture of its depth, the file has shape {image.shape} "
-            f"of {image.dtype}"
+            f"format {quoted(text)} needs a grey picture of its depth, the file has shape "
+            f"{image.shape} of {image.dtype}"
         )
     height, width = image.shape
     rows = np.ascontiguousarray(image.astype(image.dtype.newbyteorder("<"), copy=False))
     return decode_colour(
         Raster(
-            rows.reshape(-1).view(np.uint8), height, width, layout.encoding, width * image.itemsize
+            rows.reshape(-1).view(np.uint8),
+            height,
+            width,
+            layout.encoding,
+            width * image.itemsize,
+            bits=significant,
         )
     )
 
@@ -92,14 +133,19 @@ def _demosaiced(image: np.ndarray, layout: Layout, text: str) -> np.ndarray:
 def _check_complete(data: bytes, name: str) -> None:
     """Decoders fill what a cut-off file lacks with grey; that is no measurement."""
     if "compressedDepth" in name:
-        raise MessageError(f"format {name!r} is a depth image; expected a JPEG or PNG colour image")
+        raise MessageError(
+            f"format {quoted(name)} is a depth image; expected a JPEG or PNG colour image"
+        )
     if data.startswith(JPEG):
         complete = data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     elif data.startswith(PNG):
         complete = b"IEND" in data[-64:]
     else:
         raise MessageError(
-            f"the {len(data)} bytes (format {name!r}) are neither JPEG nor PNG, the known formats"
+            f"the {len(data)} bytes (format {quoted(name)}) are neither JPEG nor PNG, the known "
+            "formats"
         )
     if not complete:
-        raise MessageError(f"the compressed image (format {name!r}) ends early: {len(data)} bytes")
+        raise MessageError(
+            f"the compressed image (format {quoted(name)}) ends early: {len(data)} bytes"
+        )

@@ -12,9 +12,17 @@ from functools import partial
 import cv2
 import numpy as np
 
+FULL_BITS = 16
+_SHOWN = 40  # characters of a name that a message made up
+
 
 class MessageError(ValueError):
     """A message whose content cannot be used; says what was expected."""
+
+
+def quoted(text: str) -> str:
+    """A name of a message, as Python writes it, and no longer than a line bears."""
+    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 
 
 @dataclass(frozen=True)
@@ -23,6 +31,7 @@ class Raster:
 
     data: 1-D uint8, as it came.
     step: bytes from one row to the next; any value of at least one row's bytes.
+    bits: that the values of 16-bit encodings have.
     """
 
     data: np.ndarray
@@ -31,6 +40,7 @@ class Raster:
     encoding: str
     step: int
     big_endian: bool = False
+    bits: int = FULL_BITS
 
     def dtype(self, kind: str) -> np.dtype:
         return np.dtype((">" if self.big_endian else "<") + kind)
@@ -74,16 +84,21 @@ def _rows(raster: Raster, kind: str, channels: int) -> np.ndarray:
     return pixels.astype(dtype.newbyteorder("="), copy=False)
 
 
-def _to_uint8(pixels: np.ndarray) -> np.ndarray:
-    """16 bit over its full range to 8 bit, rounded; 8 bit as it is."""
+def to_uint8(pixels: np.ndarray, bits: int = FULL_BITS) -> np.ndarray:
+    """16-bit values of so many significant bits to 8 bit, rounded; 8 bit as it is."""
     if pixels.dtype == np.uint8:
         return pixels
+    if bits != FULL_BITS:
+        most = (1 << bits) - 1
+        values = np.minimum(pixels, most).astype(np.uint32)
+        scaled: np.ndarray = ((values * 255 + most // 2) // most).astype(np.uint8)
+        return scaled
     return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
 def _decode_packed(raster: Raster, kind: str, channels: int, to_rgb: int | None) -> np.ndarray:
     """to_rgb: OpenCV's conversion code; None when it is RGB already."""
-    pixels = _to_uint8(_rows(raster, kind, channels))
+    pixels = to_uint8(_rows(raster, kind, channels), raster.bits)
     return pixels.copy() if to_rgb is None else cv2.cvtColor(pixels, to_rgb)
 
 
@@ -117,7 +132,7 @@ def _decode_bayer(raster: Raster, kind: str, pattern: str) -> np.ndarray:
     mosaic = _rows(raster, kind, 1)[..., 0]
     mirrored = cv2.copyMakeBorder(mosaic, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
     rgb = cv2.cvtColor(mirrored, _DEMOSAIC[pattern])[2:-2, 2:-2]
-    return np.ascontiguousarray(_to_uint8(rgb))
+    return np.ascontiguousarray(to_uint8(rgb, raster.bits))
 
 
 # ITU-R BT.601, limited range, as cameras and V4L2 mean it.
@@ -254,8 +269,8 @@ DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
 def decode_colour(raster: Raster) -> np.ndarray:
     """-> H x W x 3 uint8 RGB, a new array.
 
-    16 bit is scaled over its full range; 8UC3 and 8UC4 are BGR(A), as OpenCV means them; YUV is
-    BT.601 limited range; 32FC1 is grey in 0..1.
+    16 bit is scaled over the range of the raster's bits; 8UC3 and 8UC4 are BGR(A), as OpenCV
+    means them; YUV is BT.601 limited range; 32FC1 is grey in 0..1.
 
     Raises MessageError: an encoding not in COLOUR_ENCODINGS, a step shorter than a row, data that
     does not have the bytes that step and height say, a size of zero, odd YUV sizes.
@@ -263,7 +278,8 @@ def decode_colour(raster: Raster) -> np.ndarray:
     decoder = _DECODERS.get(raster.encoding)
     if decoder is None:
         raise MessageError(
-            f"encoding {raster.encoding!r} is not known; known: {', '.join(COLOUR_ENCODINGS)}"
+            f"encoding {quoted(raster.encoding)} is not known; known: bgr8, rgb8, mono8, "
+            "bayer_rggb8, yuv422, yuyv, nv12 and their like, see docs/node.md"
         )
     _check_size(raster)
     return decoder(raster)
@@ -286,7 +302,7 @@ def decode_metric_depth(
     """
     if raster.encoding not in DEPTH_ENCODINGS:
         raise MessageError(
-            f"encoding {raster.encoding!r} is no depth; known: {', '.join(DEPTH_ENCODINGS)}"
+            f"encoding {quoted(raster.encoding)} is no depth; known: {', '.join(DEPTH_ENCODINGS)}"
         )
     _check_size(raster)
     if raster.encoding == "32FC1":

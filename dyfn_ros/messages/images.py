@@ -11,7 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_ros.messages.encodings import MessageError, Raster, decode_colour, decode_metric_depth
+from dyfn_ros.messages.encodings import (
+    FULL_BITS,
+    MessageError,
+    Raster,
+    decode_colour,
+    decode_metric_depth,
+)
 from dyfn_ros.messages.picture_size import MAX_PIXELS, check_pixels
 
 __all__ = [
@@ -26,7 +32,7 @@ __all__ = [
 ]
 
 
-def _raster(message: Any) -> Raster:
+def _raster(message: Any, bits: int = FULL_BITS) -> Raster:
     return Raster(
         data=_bytes(message.data),
         height=int(message.height),
@@ -34,6 +40,7 @@ def _raster(message: Any) -> Raster:
         encoding=str(message.encoding),
         step=int(message.step),
         big_endian=bool(message.is_bigendian),
+        bits=bits,
     )
 
 
@@ -42,13 +49,14 @@ def _bytes(data: Any) -> np.ndarray:
     return np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
 
 
-def decode_image(message: Any, most: int = MAX_PIXELS) -> np.ndarray:
+def decode_image(message: Any, most: int = MAX_PIXELS, bits: int = FULL_BITS) -> np.ndarray:
     """sensor_msgs/Image -> H x W x 3 uint8 RGB.
 
-    Raises MessageError (see decode_colour), also for more pixels than `most`.
+    bits: of the values of 16-bit encodings. Raises MessageError (see decode_colour), also for more
+    pixels than `most`.
     """
     check_pixels(int(message.width), int(message.height), most)
-    return decode_colour(_raster(message))
+    return decode_colour(_raster(message, bits))
 
 
 def decode_depth(message: Any, *, zero: bool = False, scale: float | None = None) -> np.ndarray:

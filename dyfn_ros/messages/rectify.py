@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
-from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.encodings import MessageError, quoted
 
 _LEAST_VISIBLE = 0.1  # share of an undistorted image's pixels
 
@@ -38,11 +38,16 @@ class PinholeImage:
 
 @dataclass(frozen=True)
 class RectifyRules:
-    """See the node's parameters of the same names."""
+    """See the node's parameters of the same names.
+
+    refuse_unknown_lens: whether an image is an error whose lens model cannot be undone; else it
+    goes on as it is, without intrinsics.
+    """
 
     rectified: bool = False
     distortion: str = "undistort"
     check_frame_id: bool = True
+    refuse_unknown_lens: bool = True
 
 
 class Rectifier:
@@ -61,8 +66,9 @@ class Rectifier:
     ) -> PinholeImage:
         """info: sensor_msgs/CameraInfo, or None.
 
-        Raises MessageError when the lens is distorted and that is refused, or is of a model that
-        cannot be undone. Another unusable info costs the intrinsics only, and a warning.
+        Raises MessageError when the lens is distorted and that is refused, LensError when it is of
+        a model that cannot be undone and that is refused. Another unusable info costs the
+        intrinsics only, and a warning.
         """
         if info is None:
             return PinholeImage(image)
@@ -82,7 +88,13 @@ class Rectifier:
             raise MessageError(
                 "the lens is distorted (D is not 0) and parameter distortion is refuse"
             )
-        flat = self._undistorted(image, calibration)
+        try:
+            flat = self._undistorted(image, calibration)
+        except LensError as error:
+            if rules.refuse_unknown_lens:
+                raise
+            self._warn(f"{error}; going on without intrinsics")
+            return PinholeImage(image)
         if flat.visible is not None and flat.visible.mean() < _LEAST_VISIBLE:
             self._warn(
                 f"D {list(calibration.d)} of no real lens: {flat.visible.mean():.1%} of the "
@@ -145,8 +157,9 @@ def undistortion(
         maps = cv2.fisheye.initUndistortRectifyMap(matrix, d, np.eye(3), matrix, size, cv2.CV_32FC1)
     else:
         raise LensError(
-            f"the lens model {calibration.model!r} with {d.size} coefficients cannot be undone; "
-            "known: plumb_bob (radtan), rational_polynomial, equidistant (kannala_brandt, fisheye)"
+            f"the lens model {quoted(calibration.model)} with {d.size} coefficients cannot be "
+            "undone; known: plumb_bob (radtan), rational_polynomial, equidistant (kannala_brandt, "
+            "fisheye)"
         )
     columns, rows = maps
     inside = (columns >= -0.5) & (columns <= width - 0.5) & (rows >= -0.5) & (rows <= height - 0.5)

@@ -17,11 +17,13 @@ from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_core.stream.saving import StateError, check_folder, path_for
 from dyfn_core.stream.session import ResetRequest, StreamSession
 from dyfn_ros.messages.compressed_image import decode_compressed
+from dyfn_ros.messages.encodings import FULL_BITS, quoted
 from dyfn_ros.messages.images import MessageError, decode_image
 from dyfn_ros.messages.rectify import Rectifier, RectifyRules
 from dyfn_ros.node.metric_scale import ScaleTopics
 from dyfn_ros.node.odometry import OdometryTopic, TransformTopics
 from dyfn_ros.node.outputs import NodeOutputs
+from dyfn_ros.node.pace import Pace
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.recent_jobs import RecentJobs
 from dyfn_ros.node.statistics import FrameStatistics
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
 _SENSOR_DEPTH = 5
+_OF_TWELVE_BITS = 4095 // 257  # what is left of them when 16 bits become 8
 _LOOK_TIME = 0.1  # seconds before each frame for looks at the dropped ones
 
 Say = Callable[[str], None]
@@ -75,12 +78,15 @@ class Camera:
         state_folder: str = "",
     ) -> None:
         self.name = name
-        self.title = f"{node.get_name()}: {name}" if name else node.get_name()
+        full = node.get_fully_qualified_name().lstrip("/")
+        self.title = f"{full}: {name}" if name else full
         self.statistics = FrameStatistics()
         self.active = False
         self.abandoned = False  # the node has ended; a frame that is still worked on is lost
         self.session: StreamSession | None = None  # once there is a model
-        self.outputs = NodeOutputs(ports, self.prefix, not settings().drop_frames)
+        infos = (f"{one}/camera_info" if one else "camera_info" for one in settings().cameras)
+        inputs = {node.resolve_topic_name(one) for one in infos}
+        self.outputs = NodeOutputs(ports, self.prefix, not settings().drop_frames, inputs)
         self._node, self._settings = node, settings
         self._submit, self._release, self._warn, self._error = submit, release, warn, error
         self._told_reset = told_reset
@@ -89,9 +95,12 @@ class Camera:
         self._came: RecentJobs[FrameJob] = RecentJobs()  # with drop_frames: what may be dropped
         self._placed: Frame | None = None  # the begun frame, if its pose was wanted at once
         self._state_folder = settings().state_folder or state_folder
+        self._pace = Pace()
         self._subscribe(ports)
         self._calibrator = Rectifier(lambda text: warn(f"{self.info_topic}: {text}"))
-        self.scale_topics = ScaleTopics(ports, self.prefix, self.title, settings(), transforms)
+        self.scale_topics = ScaleTopics(
+            ports, self.prefix, (self.title, self.hardware_id), settings(), transforms
+        )
         self.odometry = OdometryTopic(ports, self.prefix, settings(), transforms)
 
     @property
@@ -132,6 +141,16 @@ class Camera:
         return self._images.topic
 
     @property
+    def hardware_id(self) -> str:
+        """Of diagnostics: what tells this camera from those of other nodes."""
+        return self.image_topic
+
+    @property
+    def device(self) -> str:
+        """That its model runs on; "" before there is one."""
+        return "" if self.session is None else str(self.session.model.device)
+
+    @property
     def reliable(self) -> bool:
         """Whether lost images are sent again."""
         return self._images.reliable
@@ -153,8 +172,13 @@ class Camera:
             if self.waits_for_info:
                 self._warn(f"{self.image_topic}: {self.waiting}")
         job = FrameJob(self, message, self._info, session.asked, time.monotonic())
-        if self.settings.drop_frames:
+        settings = self.settings
+        if settings.drop_frames or settings.max_rate:
             self._came.add(job)
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        if not self._pace.takes(settings.max_rate, stamp, job.arrived):
+            self.statistics.count("skipped")
+            return
         if not self._submit(job):
             self._error(
                 f"{self.image_topic}: queue_size of {self.settings.queue_size} frames is "
@@ -182,6 +206,10 @@ class Camera:
     def resets(self) -> dict[str, int]:
         """How often the stream was reset, by reason."""
         return {} if self.session is None else dict(self.session.resets)
+
+    def calibrate(self) -> str:
+        """-> what is awaited. Raises ValueError when nothing is measured."""
+        return self._opened().request_calibration()
 
     def save_state(self) -> str:
         """-> what was saved. Raises StateError."""
@@ -227,14 +255,22 @@ class Camera:
         settings = self.settings
         compressed = settings.image_transport == "compressed"
         most = round(settings.max_megapixels * (1 << 20))
-        decode = decode_compressed if compressed else decode_image
-        image = decode(job.message, most)
+        if compressed:
+            image = decode_compressed(job.message, most, settings.image_bits, self._damaged)
+        else:
+            image = decode_image(job.message, most, settings.image_bits)
+            self._look_at_bits(str(job.message.encoding), image, settings.image_bits)
         header = job.message.header
         view = self._calibrator.view(
             image,
             header.frame_id,
             job.info or self._info,
-            RectifyRules(settings.rectified, settings.distortion, settings.check_frame_id),
+            RectifyRules(
+                settings.rectified,
+                settings.distortion,
+                settings.check_frame_id,
+                refuse_unknown_lens=False,
+            ),
         )
         frame = Frame(
             image=view.image,
@@ -244,6 +280,18 @@ class Camera:
             frame_id=header.frame_id,
         )
         return frame, view.info
+
+    def _damaged(self, text: str) -> None:
+        self.statistics.count("damaged")
+        self._warn(f"{self.image_topic}: {text}")
+
+    def _look_at_bits(self, encoding: str, image: np.ndarray, bits: int) -> None:
+        """Drivers put 10 or 12 bits into 16-bit encodings, whose pictures are then dark."""
+        if bits == FULL_BITS and "16" in encoding and 0 < image.max() <= _OF_TWELVE_BITS:
+            self._warn(
+                f"{self.image_topic}: the values of {quoted(encoding)} are below 4096 of 65536; if "
+                "the camera gives 12 bits, set image_bits:=12"
+            )
 
     def begin(self, job: FrameJob, frame: Frame) -> DepthStream:
         """-> the DepthStream that the frame goes into."""
@@ -308,7 +356,9 @@ class Camera:
             self.outputs.publish_reset(header, self.title, found.reset, self.resets)
             assert self.session is not None
             self._told_reset(f"{self.image_topic}: the stream is reset {self.session.last_reset}")
-        self.outputs.publish(header, frame.image, found, info, self.settings)
+        self.statistics.valid_ratio = self.outputs.publish(
+            header, frame.image, found, info, self.settings
+        )
         stamp = header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
         self.statistics.published(
             (self._node.get_clock().now().nanoseconds - stamp) * 1e-9,

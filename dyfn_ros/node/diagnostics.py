@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from socket import gethostname
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
@@ -11,6 +12,7 @@ from dyfn_ros.node.camera import Camera
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.statistics import StatisticsSnapshot
 
+_FEW = 0.01  # share of the pixels with depth; less is hardly what anybody wants
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
@@ -19,7 +21,8 @@ class Report:
     """What is known at one moment.
 
     phase: lifecycle state. callback_errors: callbacks that raised, so far.
-    mismatches: incompatible QoS by topic. dropped: frames per camera.
+    mismatches: incompatible QoS by topic. dropped: frames per camera. twins: what is to be said
+    of other nodes of this name, or "".
     """
 
     name: str
@@ -27,6 +30,7 @@ class Report:
     settings: NodeSettings
     device: str
     error: BaseException | None
+    twins: str
     callback_errors: int
     mismatches: Mapping[str, str]
     cameras: Sequence[Camera]
@@ -42,12 +46,17 @@ def node_diagnostics(report: Report) -> DiagnosticArray:
 
 
 def _status(
-    name: str, problems: Sequence[tuple[bytes, str]], fine: str, values: Mapping[str, str]
+    name: str,
+    hardware: str,
+    problems: Sequence[tuple[bytes, str]],
+    fine: str,
+    values: Mapping[str, str],
 ) -> DiagnosticStatus:
     """The worst problem's level and all problems' texts."""
     return DiagnosticStatus(
         level=max([level for level, _ in problems], default=OK),
         name=name,
+        hardware_id=hardware,
         message="; ".join(text for _, text in problems) or fine,
         values=[KeyValue(key=key, value=value) for key, value in values.items()],
     )
@@ -59,6 +68,8 @@ def _node(report: Report) -> DiagnosticStatus:
     ]
     if report.error is not None:
         problems.insert(0, (ERROR, f"inference has ended: {report.error!r}"))
+    if report.twins:
+        problems.append((WARN, report.twins))
     values = {
         "state": report.phase,
         "model": report.settings.model,
@@ -68,7 +79,9 @@ def _node(report: Report) -> DiagnosticStatus:
         "failed callbacks": str(report.callback_errors),
     }
     values.update({f"incompatible QoS {t}": m for t, m in sorted(report.mismatches.items())})
-    return _status(report.name, problems, report.phase, values)
+    return _status(
+        report.name, f"{gethostname()} {report.device}".strip(), problems, report.phase, values
+    )
 
 
 def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
@@ -83,8 +96,13 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     }
     for key in ("received", "published", "bad", "failed"):
         values[key] = str(snapshot.counts.get(key, 0))
+    values["damaged"] = str(snapshot.counts.get("damaged", 0))
+    valid = camera.statistics.valid_ratio
+    values["valid ratio"] = "unknown" if valid is None else f"{valid:.3f}"
+    values["device"] = camera.device
     values["lost on the way"] = str(snapshot.counts.get("lost", 0))
     values["reliability"] = "reliable" if camera.reliable else "best effort"
+    values["skipped by max_rate"] = str(snapshot.counts.get("skipped", 0))
     values["received while inactive"] = str(snapshot.counts.get("inactive", 0))
     resets = camera.resets
     values["resets"] = str(sum(resets.values()))
@@ -94,7 +112,8 @@ def _camera(report: Report, camera: Camera, dropped: int) -> DiagnosticStatus:
     values.update(camera.scale_topics.report())
     values.update(camera.odometry.report())
     problems = _camera_problems(report, camera, snapshot)
-    return _status(f"{report.name}: {camera.name or 'camera'}", problems, report.phase, values)
+    name = f"{report.name}: {camera.name or 'camera'}"
+    return _status(name, camera.hardware_id, problems, report.phase, values)
 
 
 def _milliseconds(name: str, seconds: tuple[float, float] | None) -> dict[str, str]:
@@ -123,6 +142,9 @@ def _camera_problems(
         problems.append((WARN, f"no images on {camera.image_topic}"))
     if not snapshot.same_clock:
         problems.append((WARN, f"stamps on {camera.image_topic} are not of this node's clock"))
+    ratio = camera.statistics.valid_ratio
+    if snapshot.recent.get("published") and ratio is not None and ratio < _FEW:
+        problems.append((WARN, f"{ratio:.1%} of the depth is valid"))
     if camera.session is not None:
         problems += [(ERROR, f"{text}; no depth") for text in camera.session.faults()]
         problems += [(WARN, text) for text in camera.session.problems()]

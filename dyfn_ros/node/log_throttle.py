@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable
 
+_LONGEST = 600  # characters of a line
+
 
 class Throttle:
     """Passes each distinct text on at most once per period, and says what it kept back.
@@ -27,6 +29,8 @@ class Throttle:
 
         (rclpy identifies a log call by its line of code, so the logging is left to the caller.)
         """
+        if len(text) > _LONGEST:
+            text = f"{text[:_LONGEST]}... ({len(text)} characters)"
         with self._lock:
             now = self._clock()
             self._last = {t: at for t, at in self._last.items() if now - at < self._period}

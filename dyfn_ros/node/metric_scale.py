@@ -25,18 +25,19 @@ class ScaleTopics:
     """~/scale, ~/scale/status and the reference topic of one camera.
 
     Made on configure, before there is a model; measurements that come before `open` are not kept.
+    title: of the camera in diagnostics: its name and hardware_id.
     """
 
     def __init__(
         self,
         ports: NodeTopics,
         prefix: str,
-        title: str,
+        title: tuple[str, str],
         settings: NodeSettings,
         transforms: TransformTopics,
     ) -> None:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._title = title
+        self._title, self._hardware_id = title
         self._scale = ports.publisher(Float64, f"~/{prefix}scale", latched)
         self._status = ports.publisher(DiagnosticStatus, f"~/{prefix}scale/status", latched)
         self._take: Callable[[Any], None] = lambda message: None
@@ -84,6 +85,7 @@ class ScaleTopics:
             DiagnosticStatus(
                 level=DiagnosticStatus.ERROR if faults else level,
                 name=f"{self._title}: scale",
+                hardware_id=self._hardware_id,
                 message="; ".join(faults)
                 or scale.warning
                 or ("metric" if scale.metric else "relative"),

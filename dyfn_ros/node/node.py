@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import JumpThreshold, TimeJump
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
@@ -26,11 +28,12 @@ from dyfn_ros.node.file_work import FileWork
 from dyfn_ros.node.inference import run_jobs
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.odometry import TransformTopics
+from dyfn_ros.node.pace import Chatter
 from dyfn_ros.node.parameters.declare import NodeParameters
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.service_guard import guard_services
 from dyfn_ros.node.topics import NodeTopics
-from dyfn_ros.node.worker import FrameWorker
+from dyfn_ros.node.workers import DeviceWorkers
 
 if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
@@ -41,6 +44,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 _PATIENCE = 4.0  # seconds that a transition waits for the frame being worked on
 _LAST_PATIENCE = 2.0  # the same at the end of the process, see end_request.BOUND
 _FOLLOW = 0.5  # seconds between looks at who publishes
+_RESETS = 5  # a second, by the services, before waiting frames are dropped no longer
 _POLL = 0.1  # seconds between looks at what else may end the wait for a model
 
 
@@ -59,21 +63,23 @@ class StreamDepthNode(LifecycleNode):
         ending: Callable[[], bool] = lambda: False,
         **node_options: Any,
     ) -> None:
-        super().__init__("stream_depth", **node_options)
+        super().__init__("stream_depth", enable_logger_service=True, **node_options)
         self._throttle, self._reset_throttle = Throttle(), Throttle()
         guard_services(self, self._warn)
         self._load, self._ending = load, ending
         self._phase = "unconfigured"
         self._callback_errors = 0
-        self._device = ""
-        self._worker: FrameWorker[FrameJob] | None = None
-        self._abandoned: list[FrameWorker[FrameJob]] = []  # that did not end in time
+        self._loaded: list[str] = []  # devices with a model
+        self._worker: DeviceWorkers[FrameJob] | None = None
+        self._abandoned: list[DeviceWorkers[FrameJob]] = []  # that did not end in time
         self._cameras: list[Camera] = []
         self._made: list[Callable[[], Any]] = []  # what cleanup undoes
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
         given = self.settings.state_file  # what is set later must not choose the folder
         self._state_folder = str(Path(given).expanduser().parent) if given else ""
         self._files = FileWork()
+        self._resetting = Chatter(_RESETS)
+        self._twins = 0  # other nodes of this name
         self._ports = NodeTopics(self, self._warn)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
@@ -86,6 +92,15 @@ class StreamDepthNode(LifecycleNode):
     def settings(self) -> NodeSettings:
         """The values in force."""
         return self._table.settings
+
+    @property
+    def title(self) -> str:
+        """What diagnostics call this node: its name, with its namespace."""
+        return self.get_fully_qualified_name().lstrip("/")
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """See rclpy; also values that one camera is to have for itself from now on."""
+        return self._table.set(parameter_list, super().set_parameters_atomically)
 
     @property
     def worker_error(self) -> BaseException | None:
@@ -122,9 +137,15 @@ class StreamDepthNode(LifecycleNode):
 
     def _configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         settings = self.settings
-        self._worker = FrameWorker(
+        try:
+            devices = self._devices()
+        except ValueError as error:
+            self.get_logger().error(f"cannot configure: {error}")
+            return FAILURE
+        self._worker = DeviceWorkers(
+            devices,
             lambda jobs: run_jobs(jobs, self.settings.batch),
-            prepare=self._load_model,
+            prepare=partial(self._load_model, devices),
             keep_all=not settings.drop_frames,
             capacity=settings.queue_size,
             held=[self._table.camera(name).wait_for_camera_info for name in settings.cameras],
@@ -146,6 +167,16 @@ class StreamDepthNode(LifecycleNode):
             camera.open_outputs()
         self._phase = "inactive"
         return super().on_configure(state)
+
+    def _devices(self) -> list[str]:
+        """Of each camera. Raises ValueError for one that is not here."""
+        found = []
+        for name in self.settings.cameras:
+            try:
+                found.append(str(resolve_device(self._table.camera(name).device)))
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}" if name else str(error)) from error
+        return ["cuda:0" if one == "cuda" and "cuda:0" in found else one for one in found]
 
     @property
     def _interrupted(self) -> bool:
@@ -206,7 +237,7 @@ class StreamDepthNode(LifecycleNode):
             undo()
         self._made = []
         self._ports.close()
-        self._cameras, self._worker = [], None
+        self._cameras, self._worker, self._loaded = [], None, []
         self._phase = "unconfigured"
 
     # What a configured node is made of.
@@ -237,6 +268,7 @@ class StreamDepthNode(LifecycleNode):
             "reset": self._on_reset,
             "save_state": partial(self._on_state, "save_state"),
             "load_state": partial(self._on_state, "load_state"),
+            "calibrate": self._on_calibrate,
         }
         for prefix, indices in prefixes.items():
             for name, answer in answers.items():
@@ -251,6 +283,7 @@ class StreamDepthNode(LifecycleNode):
         for callback, period in (
             (self.publish_diagnostics, self.settings.diagnostics_period),
             (self._ports.check_publishers, _FOLLOW),
+            (self._look_for_twins, _FOLLOW),
         ):
             timer = self.create_timer(period, callback, MutuallyExclusiveCallbackGroup())
             self._made.append(partial(self.destroy_timer, timer))
@@ -275,10 +308,33 @@ class StreamDepthNode(LifecycleNode):
     def _on_reset(
         self, indices: list[int], _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        dropped = sum(self._reset(index, RESET_SERVICE) for index in indices)
+        often = self._resetting()
+        if often:
+            self._warn(
+                f"more than {_RESETS} resets a second are asked for: the stream keeps no memory; "
+                "frames that wait are worked on first, so that depth goes on"
+            )
+        dropped = sum(self._reset(index, RESET_SERVICE, not often) for index in indices)
         response.success = True
         response.message = f"the next frame resets the stream ({dropped} waiting frames dropped)"
         if line := self._throttle(f"reset: {response.message}"):
+            self.get_logger().info(line)
+        return response
+
+    def _on_calibrate(
+        self, indices: list[int], _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        """Measure the scale anew, by what comes from now on; success when all cameras can."""
+        lines, response.success = [], True
+        for camera in (self._cameras[index] for index in indices):
+            title = f"{camera.name}: " if camera.name else ""
+            try:
+                lines.append(title + camera.calibrate())
+            except ValueError as error:
+                response.success = False
+                lines.append(f"{title}{error}")
+        response.message = "; ".join(lines)
+        if line := self._throttle(f"calibrate: {response.message}"):
             self.get_logger().info(line)
         return response
 
@@ -302,23 +358,42 @@ class StreamDepthNode(LifecycleNode):
             logger.error(f"{what}: {response.message}")
         return response
 
-    def _reset(self, index: int, reason: str) -> int:
-        """-> how many waiting frames were dropped."""
+    def _reset(self, index: int, reason: str, drop: bool = True) -> int:
+        """drop: what waits, if frames may be dropped. -> how many were."""
         self._cameras[index].request_reset(reason)
-        if self._worker is None or not self.settings.drop_frames:
+        if self._worker is None or not self.settings.drop_frames or not drop:
             return 0
         return self._worker.discard(index)
+
+    def _look_for_twins(self) -> None:
+        """Two nodes of one name answer each other's services, and their outputs mix."""
+        own = (self.get_name(), self.get_namespace())
+        self._twins = max(0, self.get_node_names_and_namespaces().count(own) - 1)
+        if self._twins:
+            self._warn(self._twin_problem)
+
+    @property
+    def _twin_problem(self) -> str:
+        """ "" when there is no other node of this name."""
+        if not self._twins:
+            return ""
+        return (
+            f"{self._twins} other node is called {self.get_fully_qualified_name()} too, or was "
+            "killed lately: their topics and services are the same, give each its own name or "
+            "namespace (-r __node:=NAME, -r __ns:=/NAME)"
+        )
 
     def publish_diagnostics(self) -> None:
         """One status for the node and one for each camera."""
         if self._diagnostics.get_subscription_count() == 0:
             return
         report = Report(
-            name=self.get_name(),
+            name=self.title,
             phase=self._phase,
             settings=self.settings,
-            device=self._device,
+            device=", ".join(self._loaded),
             error=self.worker_error,
+            twins=self._twin_problem,
             callback_errors=self._callback_errors,
             mismatches=self._ports.mismatches,
             cameras=self._cameras,
@@ -330,19 +405,20 @@ class StreamDepthNode(LifecycleNode):
 
     # Inference thread.
 
-    def _load_model(self) -> None:
+    def _load_model(self, devices: list[str], device: str) -> None:
+        """devices: of each camera. device: whose cameras get a model."""
         import torch
 
         settings = self.settings
         if settings.threads:
             torch.set_num_threads(settings.threads)
-        device = str(resolve_device(settings.device))
         model = self._load(settings.model, device)
-        for camera in self._cameras:
+        cameras = [one for one, own in zip(self._cameras, devices, strict=True) if own == device]
+        for camera in cameras:
             camera.open_stream(model)
-        self._device = device
+        self._loaded.append(device)
         if not self._interrupted:  # loading takes long enough
-            sources = {camera.settings.metric_source for camera in self._cameras} - {"none"}
+            sources = {camera.settings.metric_source for camera in cameras} - {"none"}
             unit = f"metres come from {', '.join(sorted(sources))}"
             if not sources:
                 unit = "depth is right up to one scale, which is not metres"
@@ -374,11 +450,13 @@ class StreamDepthNode(LifecycleNode):
         lines = []
         for index, camera in enumerate(self._cameras):
             counts = camera.statistics.counts
+            skipped = f"{counts['skipped']} skipped, " if counts["skipped"] else ""
             lines.append(
                 f"{camera.name + ': ' if camera.name else ''}{counts['received']} frames received, "
                 f"{counts['published']} worked on, "
-                f"{self._dropped(index) + counts['unpublished']} dropped, {counts['bad']} bad, "
-                f"{counts['failed']} failed; {sum(camera.resets.values())} resets"
+                f"{self._dropped(index) + counts['unpublished']} dropped, {skipped}"
+                f"{counts['bad']} bad, {counts['failed']} failed; "
+                f"{sum(camera.resets.values())} resets"
             )
         return lines
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Float32
 
+from dyfn_core.evaluation.report.colours import colour_depth, depth_range
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.prediction import Prediction
 from dyfn_ros.messages.camera_info import camera_info_message
@@ -21,6 +24,7 @@ from dyfn_ros.messages.images import (
     depth_message,
     normal_message,
 )
+from dyfn_ros.node.output_size import smaller
 from dyfn_ros.node.parameters.table import NodeSettings
 from dyfn_ros.node.topics import NodeTopics
 
@@ -32,10 +36,13 @@ _RESETS_DEPTH = 10
 class NodeOutputs:
     """The topics `~/depth/...`, `~/points`, `~/normal` and `~/resets` of one camera.
 
-    prefix: "" or "CAMERA/", before each of these names. The inference thread publishes.
+    prefix: "" or "CAMERA/", before each of these names. inputs: topics of camera_info that the node
+    subscribes. The inference thread publishes.
     """
 
-    def __init__(self, ports: NodeTopics, prefix: str, lossless: bool) -> None:
+    def __init__(
+        self, ports: NodeTopics, prefix: str, lossless: bool, inputs: Collection[str] = ()
+    ) -> None:
         depth = _LOSSLESS_DEPTH if lossless else _OUTPUT_DEPTH
         qos = QoSProfile(depth=depth, history=HistoryPolicy.KEEP_LAST)
         latched = QoSProfile(
@@ -47,9 +54,11 @@ class NodeOutputs:
         def advertise(kind: type, topic: str) -> Any:
             return ports.publisher(kind, f"~/{prefix}{topic}", qos)
 
+        names = ports.depth_names(f"~/{prefix}depth/image", f"~/{prefix}depth/camera_info", inputs)
         self._depth = advertise(Image, "depth/image")
-        self._packed = advertise(CompressedImage, "depth/image/compressedDepth")
-        self._info = advertise(CameraInfo, "depth/camera_info")
+        self._packed = ports.publisher(CompressedImage, names.compressed, qos)
+        self._info = ports.publisher(CameraInfo, names.info, qos)
+        self._valid_ratio = ports.publisher(Float32, f"~/{prefix}valid_ratio", QoSProfile(depth=10))
         self._colored = advertise(Image, "depth/colored")
         self._points = advertise(PointCloud2, "points")
         self._normal: Any = None
@@ -73,10 +82,17 @@ class NodeOutputs:
         prediction: Prediction[np.ndarray],
         info: CameraInfo | None,
         settings: NodeSettings,
-    ) -> None:
-        """header: of the input, kept as it is. info: describes the image; None when unknown."""
+    ) -> float:
+        """header: of the input, kept as it is. info: describes the image; None when unknown.
+
+        -> the share of pixels with depth.
+        """
+        if settings.output_scale != 1.0:
+            prediction, image, info = smaller(prediction, image, info, settings.output_scale)
         depth, encoding = prediction.depth, settings.depth_encoding
         valid = in_range(depth, prediction.valid, settings.min_depth, settings.max_depth)
+        share = float(valid.mean())
+        self._valid_ratio.publish(Float32(data=share))
         if settings.publish_depth:
             if self._depth.get_subscription_count():
                 self._depth.publish(depth_message(header, depth, valid, encoding))
@@ -94,9 +110,9 @@ class NodeOutputs:
         if settings.publish_points and self._points.get_subscription_count():
             cloud = filtered_cloud(prediction, valid, image, settings)
             self._points.publish(cloud_message(header, cloud))
-
         if prediction.normal is not None and self.wants_normals(settings):
             self._normal.publish(normal_message(header, prediction.normal, valid))
+        return share
 
     def publish_reset(self, header: Any, name: str, reason: str, counts: dict[str, int]) -> None:
         """header: of the first frame after the reset. counts: resets so far, by reason."""
@@ -117,11 +133,6 @@ class ColourScale:
 
     def paint(self, depth: np.ndarray) -> np.ndarray:
         """H x W depth, NaN invalid -> H x W x 3 uint8 RGB, see colour_depth."""
-        from dyfn_core.evaluation.report.pictures import (  # imports matplotlib
-            colour_depth,
-            depth_range,
-        )
-
         sample = depth[::4, ::4]
         if np.isfinite(sample).any():
             now = np.log(depth_range([sample]))

@@ -19,8 +19,8 @@ class StatisticsSnapshot:
     """The numbers of one moment.
 
     counts: since the start: received, published, bad (not usable), failed (inference raised),
-        unpublished (the shutdown came first), inactive (came while the node was not active), lost
-        (sent, and never here).
+        skipped (by max_rate), damaged (worked on all the same), unpublished (the shutdown came
+        first), inactive (came while the node was not active), lost (sent, and never here).
     input_rate, output_rate: frames a second since the snapshot before.
     latency: p50 and p99 in seconds from input stamp to publishing, None before the first frame.
     same_clock: whether these latencies are plausible at all.
@@ -48,6 +48,7 @@ class FrameStatistics:
         self._processing: deque[float] = deque(maxlen=WINDOW)
         self._before: Counter[str] = Counter()
         self._at = clock()
+        self.valid_ratio: float | None = None  # share of valid pixels of the last frame published
 
     def count(self, what: str, number: int = 1) -> None:
         """So many more of these; see StatisticsSnapshot.counts."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -28,6 +29,14 @@ _OVERRIDES = "qos_overrides."
 _OF_RCLPY = ("/clock", "/diagnostics", "/parameter_events", "/rosout")
 
 
+@dataclass(frozen=True)
+class DepthNames:
+    """Topics that belong to a depth image: its compressed form, and its camera_info."""
+
+    compressed: str
+    info: str
+
+
 class NodeTopics:
     """Makes a node's topics and destroys them together."""
 
@@ -45,6 +54,32 @@ class NodeTopics:
         """By topic: whom it cannot be connected with, and by which policy."""
         with self._lock:
             return dict(self._mismatches)
+
+    def depth_names(self, image: str, info: str, inputs: Collection[str]) -> DepthNames:
+        """What goes along when a depth image is remapped, as image_transport has it.
+
+        camera_info is beside the image; below it where the node has a topic of that name already.
+        Either name may be remapped on its own. image, info: names before remapping. inputs: topics
+        that the node subscribes, resolved.
+        """
+        resolve = self._node.resolve_topic_name
+        topic = resolve(image)
+        compressed = resolve(f"{image}/compressedDepth")
+        found = resolve(info)
+        if topic != self._unmapped(image):
+            if compressed == self._unmapped(f"{image}/compressedDepth"):
+                compressed = f"{topic}/compressedDepth"
+            if found == self._unmapped(info):
+                found = f"{topic.rpartition('/')[0]}/camera_info"
+                if found in inputs or found in (one.topic_name for one in self._publishers):
+                    self._warn(
+                        f"the camera_info of {topic} is {topic}/camera_info: {found} is another's"
+                    )
+                    found = f"{topic}/camera_info"
+        return DepthNames(compressed, found)
+
+    def _unmapped(self, name: str) -> str:
+        return f"{self._node.get_fully_qualified_name()}{name.removeprefix('~')}"
 
     def publisher(self, kind: type, topic: str, qos: QoSProfile) -> Any:
         """A lifecycle publisher: silent while the node is inactive."""

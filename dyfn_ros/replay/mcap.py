@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dyfn_core.evaluation.report.pictures import colour_depth, depth_range
+from dyfn_core.evaluation.report.colours import colour_depth, depth_range
 from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import sample_grid

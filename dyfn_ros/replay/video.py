@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dyfn_core.evaluation.report.colours import colour_depth, colour_error, depth_range
 from dyfn_core.evaluation.report.frame_grid import depth_bar, draw_bars, error_bar
-from dyfn_core.evaluation.report.pictures import colour_depth, colour_error, depth_range
 from dyfn_ros.replay.frame_spool import FrameSpool, SmallFrame
 from dyfn_ros.replay.mp4 import Mp4File, load_av
 from dyfn_ros.replay.scale_curve import ScaleCurve

@@ -11,15 +11,13 @@ from html import escape
 import cv2
 import numpy as np
 
-from dyfn_core.evaluation.report.pictures import (
+from dyfn_core.evaluation.report.colours import (
     MAX_ERROR,
-    DepthSnapshot,
     colour_depth,
     colour_error,
     depth_range,
-    encode_picture,
-    snapshot,
 )
+from dyfn_core.evaluation.report.pictures import DepthSnapshot, encode_picture, snapshot
 from dyfn_core.prediction import DEPTH
 from dyfn_core.scoring.protocols import align_depth
 

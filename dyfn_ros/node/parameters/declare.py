@@ -74,6 +74,15 @@ def _descriptor(spec: Spec) -> ParameterDescriptor:
     return descriptor
 
 
+def _as_declared(parameter: Parameter) -> Parameter:
+    """A whole number where the table has a DOUBLE (`max_depth:=5`) as that; others as they are."""
+    spec = SPECS.get(parameter.name.rpartition(".")[2])
+    kind = Parameter.Type
+    if spec is None or not isinstance(spec.default, float) or parameter.type_ != kind.INTEGER:
+        return parameter
+    return Parameter(parameter.name, kind.DOUBLE, float(parameter.value))
+
+
 def check(changes: Mapping[str, Any], in_force: Mapping[str, Any], configured: bool = False) -> str:
     """What the descriptors cannot say. -> why the changes are refused, or "".
 
@@ -113,8 +122,9 @@ def check_cameras(names: Sequence[str]) -> str:
 class NodeParameters:
     """Declares the table on a node and keeps the settings up to date.
 
-    A value for one camera, `CAMERA.NAME`, is declared when it is given at start; without it the
-    node's value is in force. configured: whether CONFIGURE parameters are fixed just now.
+    A value for one camera, `CAMERA.NAME`, is declared when it is given, at start or later; without
+    it the node's value is in force. A whole number is taken for a DOUBLE as well. configured:
+    whether CONFIGURE parameters are fixed just now.
     Raises rclpy's InvalidParameterValueException or InvalidParameterTypeException when a value
     given at start is not allowed.
     """
@@ -124,6 +134,8 @@ class NodeParameters:
         self._configured = configured
         self._own: dict[str, dict[str, str]] = {}
         node.add_on_set_parameters_callback(self._check)
+        given = node._parameter_overrides
+        given.update({one.name: one for one in map(_as_declared, given.values())})
         for name, spec in SPECS.items():
             node.declare_parameter(name, spec.default, _descriptor(spec))
         self.settings = self._read("")
@@ -137,6 +149,40 @@ class NodeParameters:
     def camera(self, name: str) -> NodeSettings:
         """The settings of one camera."""
         return self._by_camera[name]
+
+    def set(
+        self,
+        changes: Sequence[Parameter],
+        on_node: Callable[[list[Parameter]], SetParametersResult],
+    ) -> SetParametersResult:
+        """Set parameters on the node, those of one camera too that have not been given before.
+
+        on_node: sets what is declared, all or nothing; what it raises, this raises.
+        """
+        new = list(dict.fromkeys(one.name for one in changes if self._is_new(one.name)))
+        for full in new:
+            camera, _, name = full.partition(".")
+            self._node.declare_parameter(
+                full, getattr(self.camera(camera), name), _descriptor(SPECS[name])
+            )
+            self._own[camera][name] = full
+        result = SetParametersResult(successful=False)
+        try:
+            result = on_node([_as_declared(one) for one in changes])
+        finally:
+            if not result.successful:
+                for full in new:
+                    camera, _, name = full.partition(".")
+                    del self._own[camera][name]
+                    self._node.undeclare_parameter(full)
+        return result
+
+    def _is_new(self, full: str) -> bool:
+        """Whether it is a setting that a camera may have for itself, and has not."""
+        camera, _, name = full.partition(".")
+        spec = SPECS.get(name)
+        own = self._own.get(camera) if camera else None
+        return spec is not None and spec.per_camera and own is not None and name not in own
 
     def _declare_own(self, camera: str) -> dict[str, str]:
         """Parameter by setting, for the settings that this camera has for itself."""

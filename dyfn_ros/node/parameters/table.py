@@ -51,7 +51,9 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
     device: str = _parameter(
         _NODE,
         "auto",
-        "Device that runs the model: auto (a GPU if there is one), cpu, cuda, cuda:N.",
+        "Device that runs the model: auto (a GPU if there is one), cpu, cuda, cuda:N. Cameras of "
+        "several devices have a model and a thread for each.",
+        per_camera=True,
     )
     threads: int = _parameter(
         _NODE,
@@ -92,6 +94,24 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         changes=RUN,
         per_camera=True,
         range=(0.001, 64.0),
+    )
+    image_bits: int = _parameter(
+        _INPUT,
+        16,
+        "Bits that the values of 16-bit encodings (mono16, bayer_rggb16, ...) have: 12 for a "
+        "camera of 12 bits whose values are not shifted up.",
+        changes=RUN,
+        per_camera=True,
+        range=(8, 16),
+    )
+    max_rate: float = _parameter(
+        _INPUT,
+        0.0,
+        "Images a second, by their stamps, that are worked on; the others are skipped. 0 is no "
+        "limit.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.0, 1000.0),
     )
     drop_frames: bool = _parameter(
         _INPUT,
@@ -170,6 +190,15 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         "Publish ~/normal, of a model that has normals, when somebody subscribes.",
         changes=RUN,
         per_camera=True,
+    )
+    output_scale: float = _parameter(
+        _OUTPUT,
+        1.0,
+        "Size of depth, colours, cloud and their camera_info over the image's; each pixel has the "
+        "depth of the image's pixel at its centre.",
+        changes=RUN,
+        per_camera=True,
+        range=(0.01, 1.0),
     )
     min_depth: float = _parameter(
         _OUTPUT,

@@ -6,6 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from dyfn_core.evaluation.report.colours import (
+    INVALID,
+    colour_depth,
+    colour_error,
+    depth_range,
+)
 from dyfn_core.evaluation.report.frame_grid import BAR, FrameStrip
 from dyfn_core.evaluation.report.html import (
     ReportPicture,
@@ -16,15 +22,7 @@ from dyfn_core.evaluation.report.html import (
     text_table,
     write_report,
 )
-from dyfn_core.evaluation.report.pictures import (
-    INVALID,
-    colour_depth,
-    colour_error,
-    curves,
-    depth_range,
-    draw_cloud,
-    encode_picture,
-)
+from dyfn_core.evaluation.report.pictures import curves, draw_cloud, encode_picture
 
 
 def test_near_is_red_far_is_blue_and_invalid_is_grey() -> None:

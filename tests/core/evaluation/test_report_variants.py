@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from dyfn_core.evaluation.report.cloud_view import POINTS, CloudView, PointCloud, cloud_html
+from dyfn_core.evaluation.report.colours import colour_depth
 from dyfn_core.evaluation.report.curves import Curves, curves_html
 from dyfn_core.evaluation.report.frame_grid import ShownFrames, frame_grid, grid_picture
-from dyfn_core.evaluation.report.pictures import DepthSnapshot, colour_depth
+from dyfn_core.evaluation.report.pictures import DepthSnapshot
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.report.variants import (
     Role,

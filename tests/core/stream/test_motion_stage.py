@@ -150,6 +150,20 @@ def test_poses_that_contradict_the_pictures_give_no_metres() -> None:
     assert "contradicts the pictures: reprojection error" in session.problems()[0]
 
 
+def test_a_calibration_that_is_asked_for_counts_more(
+    walked: list[tuple[Frame, np.ndarray]],
+) -> None:
+    """What is known is less certain afterwards, and the metres go on."""
+    session, asked = session_of(), session_of()
+    pushed(session, walked[:12])
+    pushed(asked, walked[:12])
+    assert "by odometry" in asked.request_calibration()
+    one, other = session.push(walked[12][0]), asked.push(walked[12][0])
+    assert one.metric and other.metric
+    assert asked.scale.spread > session.scale.spread
+    assert error(pushed(asked, walked[13:])[-1], walked[-1][1]) < 0.08
+
+
 def test_an_odometry_in_no_metres_gives_no_metres(
     walked: list[tuple[Frame, np.ndarray]],
 ) -> None:

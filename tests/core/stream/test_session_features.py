@@ -113,6 +113,33 @@ def test_absurd_measurements_give_no_metres_and_are_said() -> None:
     assert session.scale.map.scale == pytest.approx(2.5, rel=0.1)
 
 
+def test_a_calibration_can_be_asked_for() -> None:
+    """The former scale stays in force until the new one is known; no reset."""
+    session = session_of(
+        metric_source="reference", calibration_seconds=0.2, frozen_after=0.0, stabilize=False
+    )
+    first = push(session, picture(0), 0.0)
+    camera, depth = first.camera_matrix, first.depth[::4, ::4]
+    rows, columns = np.mgrid[0 : 4 * depth.shape[0] : 4, 0 : 4 * depth.shape[1] : 4]
+    x, y = (columns - camera[0, 2]) / camera[0, 0], (rows - camera[1, 2]) / camera[1, 1]
+    points = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None]
+    scales = []
+    for index in range(1, 24):
+        if index == 10:
+            assert "until then 2 stays in force" in session.request_calibration()
+        metres = (2.0 if index < 10 else 5.0) * points.reshape(-1, 3)
+        session.add_reference(index / 10, PointReference(metres))
+        push(session, picture(0), index / 10)
+        scales.append(session.scale.map.scale if session.scale.map else 0.0)
+        if index == 10:
+            assert "kept from before the calibration" in session.problems()[0]
+    assert scales[4:10] == pytest.approx([2.0] * 6, rel=0.02)
+    assert scales[13:] == pytest.approx([5.0] * 10, rel=0.02)
+    assert not session.problems() and not session.resets
+    with pytest.raises(ValueError, match="metric_source is 'fixed', which measures nothing"):
+        session_of(metric_source="fixed").request_calibration()
+
+
 def test_the_camera_s_height_over_a_floor_gives_metres() -> None:
     """A floor 0.5 units below a level camera that is 1.5 m above it."""
     model = PinholeModel()

@@ -11,6 +11,7 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
+from dyfn_ros.messages.camera_info import decode_camera_info, resized_camera_info
 from dyfn_ros.messages.images import MessageError
 from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules, undistort_depth
 
@@ -162,3 +163,32 @@ def test_nonsense_costs_the_intrinsics_and_is_said(change: dict[str, Any], reaso
     assert found.matrix is None and found.visible is None
     np.testing.assert_array_equal(found.image, image)
     assert len(said) == 1 and reason in said[0]
+
+
+def test_an_unknown_lens_may_cost_the_intrinsics_only() -> None:
+    found, warnings = view(info("ocam", [0.1, 0.2]), refuse_unknown_lens=False)
+    assert (found.matrix, found.info, found.visible) == (None, None, None)
+    assert "'ocam' with 2 coefficients cannot be undone" in warnings[0]
+    with pytest.raises(MessageError, match="parameter distortion is refuse"):
+        view(info("ocam", [0.1, 0.2]), refuse_unknown_lens=False, distortion="refuse")
+
+
+@pytest.mark.parametrize("size", [(30, 40), (15, 20), (20, 26), (1, 1)])
+def test_camera_info_of_a_smaller_image_sees_the_same_rays(size: tuple[int, int]) -> None:
+    """Also of an image that is a binned region of the sensor."""
+    message = info(p=[70.0, 0, 41, -7, 0, 72, 28, 3.5, 0, 0, 1, 0])
+    message.height, message.width, message.binning_x, message.binning_y = 200, 300, 2, 3
+    roi = message.roi
+    roi.x_offset, roi.y_offset, roi.width, roi.height = 11, 5, 160, 180
+    before = decode_camera_info(message, HEIGHT, WIDTH)
+    small = resized_camera_info(message, *size)
+    after = decode_camera_info(small, *size)
+    factors = np.array([size[1] / WIDTH, size[0] / HEIGHT])
+    corners = np.array([[-0.5, -0.5], [WIDTH - 0.5, HEIGHT - 0.5], [12.0, 7.0]])
+    rays = (corners - before.matrix[:2, 2]) / before.matrix[[0, 1], [0, 1]]
+    found = rays * after.matrix[[0, 1], [0, 1]] + after.matrix[:2, 2]
+    np.testing.assert_allclose(found, factors * (corners + 0.5) - 0.5, atol=1e-9)
+    p = np.reshape(small.p, (3, 4))
+    np.testing.assert_allclose(p[:2, :3], after.matrix[:2], atol=1e-9)
+    np.testing.assert_allclose(p[:2, 3], [-7 / 2 * factors[0], 3.5 / 3 * factors[1]])
+    assert (message.height, message.roi.x_offset, message.k[2]) == (200, 11, K[0, 2])

@@ -204,6 +204,22 @@ def test_odd_width_of_shared_chroma_is_refused(encoding: str) -> None:
         decode_colour(raster(bytes(100), 2, 3, encoding, 6))
 
 
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+def test_sixteen_bit_encodings_may_have_fewer_bits(bits: int) -> None:
+    most = (1 << bits) - 1
+    values = np.array([0, 1, most // 2, most - 1, most, 65535], "<u2")
+    found = decode_colour(Raster(values.view(np.uint8), 1, 6, "mono16", 12, bits=bits))
+    exact = np.minimum(values, most) * (255 / most)
+    assert np.abs(found[0, :, 0] - exact).max() <= 0.5
+    assert found[0, -2:, 0].tolist() == [255, 255]
+
+
+def test_a_name_of_any_length_is_said_shortly() -> None:
+    with pytest.raises(MessageError) as error:
+        decode_colour(raster(bytes(12), 2, 2, "j" * 100_000, 6))
+    assert len(str(error.value)) < 200
+
+
 def test_unknown_encoding_is_refused_with_the_known_ones() -> None:
     with pytest.raises(MessageError, match=r"'jello' is not known; known: .*bgr8.*yuyv"):
         decode_colour(raster(bytes(12), 2, 2, "jello", 6))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import array
+import os
 import struct
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -24,6 +26,7 @@ from dyfn_ros.messages.camera_info import camera_info_message, decode_camera_inf
 from dyfn_ros.messages.clouds import CLOUD_DTYPE, cloud_message, cloud_points, pack_cloud
 from dyfn_ros.messages.compressed_image import Layout, decode_compressed, parse_format
 from dyfn_ros.messages.images import MessageError
+from dyfn_ros.messages.jpeg_complaints import with_complaints
 
 K = [100.0, 0.0, 63.5, 0.0, 110.0, 47.5, 0.0, 0.0, 1.0]
 
@@ -156,6 +159,54 @@ def test_cut_off_files_are_refused(suffix: str, share: float) -> None:
     data = encoded(suffix, np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8))
     with pytest.raises(MessageError, match="ends early"):
         decode_compressed(compressed(data[: int(share * len(data))], "jpeg"))
+
+
+def jpeg() -> bytes:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3), np.uint8)
+    return bytes(encoded(".jpg", cv2.resize(noise, (320, 240))))
+
+
+def test_a_damaged_jpeg_is_refused_and_nothing_goes_to_standard_error(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    whole = jpeg()
+    flipped = bytearray(whole)
+    for place in np.random.default_rng(0).integers(1000, len(whole) - 100, 20):
+        flipped[place] ^= 0x55
+    for data in (whole[: len(whole) // 2] + b"\xff\xd9", bytes(flipped)):
+        with pytest.raises(MessageError, match="the JPEG is damaged: Corrupt JPEG data"):
+            decode_compressed(compressed(data, "jpeg"))
+    assert capfd.readouterr().err == ""
+
+
+def test_a_jpeg_that_is_whole_but_for_its_end_is_used_and_told() -> None:
+    whole, told = jpeg(), []
+    data = whole[:-2] + bytes(6) + whole[-2:]
+    found = decode_compressed(compressed(data, "jpeg"), damaged=told.append)
+    assert np.array_equal(found, decode_compressed(compressed(whole, "jpeg")))
+    (text,) = told
+    assert re.fullmatch("the JPEG is damaged, but whole: .* [1-8] extraneous bytes .*", text)
+
+
+def test_what_others_write_to_standard_error_meanwhile_is_passed_on(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    def decode() -> int:
+        os.write(2, b"from elsewhere\nCorrupt JPEG data: bad Huffman code\n")
+        return 7
+
+    assert with_complaints(decode) == (7, ["Corrupt JPEG data: bad Huffman code"])
+    assert capfd.readouterr().err == "from elsewhere\n"
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14])
+@pytest.mark.parametrize("name", ["mono16", "bayer_rggb16"])
+def test_sixteen_bit_files_may_have_fewer_bits(name: str, bits: int) -> None:
+    level = round(120 / 255 * ((1 << bits) - 1))
+    data = encoded(".png", np.full((8, 6), level, np.uint16))
+    for layout in (f"{name}; png compressed ", name):
+        got = decode_compressed(compressed(data, layout), bits=bits)
+        assert np.abs(got.astype(int) - 120).max() <= 1
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
 import torch
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import LoggerLevel
+from rcl_interfaces.srv import ListParameters, SetLoggerLevels
 from rclpy.qos import (
     DurabilityPolicy,
     QoSProfile,
     ReliabilityPolicy,
 )
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Float32
 
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.stream.depth_stream import DepthStream
@@ -94,6 +98,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
         "diagnostics_period": 0.1,
         "left.max_gap": 50.0,
         "left.reliability": "reliable",
+        "left.device": "cpu",
     }
     with own_domain() as environment:
         node = tiny_node(environment, tmp_path_factory.mktemp("node"), **parameters)
@@ -221,7 +226,6 @@ def test_what_ends_the_past_is_published_with_its_reason_and_stamp(
 def test_a_camera_may_have_a_value_of_its_own(rig: Rig) -> None:
     """left.max_gap is 50 s, front has the node's 5 s."""
     assert rig.probe.set("left.max_gap", 60.0).successful
-    assert not rig.probe.set("front.max_gap", 60.0).successful
     for camera in BOTH:
         rig.play(camera, frames(1))
     rig.now += 20.0
@@ -229,6 +233,135 @@ def test_a_camera_may_have_a_value_of_its_own(rig: Rig) -> None:
     assert rig.reset_at("front", stamps["front"])[0] == "gap between stamps"
     rig.depth("left", stamps["left"])
     assert stamps["left"] not in map(stamp_of, rig.probe.received["left/resets"])
+
+
+def test_a_camera_s_own_value_can_be_given_later(rig: Rig) -> None:
+    """A whole number does for a DOUBLE; what is refused is not there afterwards."""
+    for name, value in {
+        "front.nothing": 1,
+        "front.cameras": 1,
+        "front.queue_size": 5,  # of the whole node
+        "left.points_stride": -1,
+        "left.min_depth": "near",
+        "left.image_transport": "compressed",  # while the node is configured
+        "left.distortion": "maybe",
+        "nobody.max_gap": 1,
+    }.items():
+        result = rig.probe.set(name, value)
+        assert (result.successful, bool(result.reason)) == (False, True), name
+    listed = rig.probe.call(ListParameters, "list_parameters", ListParameters.Request()).result
+    assert not {name for name in listed.names if name.startswith("front.")}
+    assert {name for name in listed.names if name.startswith("left.")} == {
+        "left.max_gap",
+        "left.reliability",
+        "left.device",
+    }
+    for value in (30, 31.0):
+        assert rig.probe.set("front.max_gap", value).successful
+    for camera in BOTH:
+        rig.play(camera, frames(1))
+    rig.now += 20.0
+    stamp = rig.send("front", frames(1)[0])
+    rig.depth("front", stamp)
+    assert stamp not in map(stamp_of, rig.probe.received["front/resets"])
+    assert rig.probe.set("front.max_gap", 5).successful
+    assert rig.probe.set("max_depth", 5).successful
+    assert not rig.probe.set("max_depth", -5).successful
+    assert rig.probe.set("max_depth", 0).successful
+
+
+def test_a_rate_thins_out_the_images_by_their_stamps(rig: Rig) -> None:
+    rig.play("front", frames(1))
+    assert rig.probe.set("front.max_rate", 5).successful
+    rig.now += 1.0
+    stamps = [rig.send("front", frames(1)[0], 0.1) for _ in range(9)]
+    rig.depth("front", stamps[-1])
+    done = set(map(stamp_of, rig.probe.received["front/depth/image"]))
+    assert [stamp in done for stamp in stamps] == [True, False] * 4 + [True]
+    assert rig.probe.set("front.max_rate", 0).successful
+    assert rig.diagnostics()["stream_depth: front"][1]["skipped by max_rate"] == "4"
+
+
+def test_outputs_can_be_smaller_than_the_image(rig: Rig) -> None:
+    topics = {"front/depth/camera_info": CameraInfo, "front/points": PointCloud2}
+    for topic, kind in topics.items():
+        if not rig.probe.received[topic]:
+            rig.probe.listen(topic, kind)
+    rig.probe.wait(
+        lambda: (rig.play("front", frames(1)), all(rig.probe.received[t] for t in topics))[1]
+    )
+    rig.reset()
+    whole = as_depth(rig.play("front", frames(1))[0])
+    assert rig.probe.set("front.output_scale", 0.5).successful
+    rig.reset()
+    stamp = rig.send("front", frames(1)[0])
+    small = rig.message("front/depth/image", stamp)
+    assert (small.height, small.width) == (18, 24)
+    depth = as_depth(bytes(small.data), 18, 24)
+    assert np.array_equal(depth, whole[1::2, 1::2], equal_nan=True)
+    info = rig.message("front/depth/camera_info", stamp)
+    cloud = cloud_points(rig.message("front/points", stamp))
+    assert (info.height, info.width) == cloud.shape == (18, 24)
+    matrix = np.reshape(info.k, (3, 3))
+    valid = np.isfinite(cloud["z"])
+    assert valid.any()
+    rows, columns = np.nonzero(valid)
+    for axis, index, pixels in (("x", 0, columns), ("y", 1, rows)):
+        projected = cloud[axis] / cloud["z"] * matrix[index, index] + matrix[index, 2]
+        np.testing.assert_allclose(projected[valid], pixels, atol=1e-3)
+    assert rig.probe.set("front.output_scale", 1).successful
+
+
+def test_the_share_of_valid_pixels_is_published_and_a_low_one_is_a_problem(rig: Rig) -> None:
+    ratios = rig.probe.listen("front/valid_ratio", Float32)
+    rig.probe.wait(lambda: (rig.play("front", frames(1)), ratios)[1])
+    depth = as_depth(rig.play("front", frames(1))[0])
+    rig.probe.wait(lambda: ratios[-1].data == np.float32(np.isfinite(depth).mean()))
+    assert rig.probe.set("front.min_depth", 1e5).successful
+
+    def said() -> bool:
+        assert np.isnan(as_depth(rig.play("front", frames(1))[0])).all()
+        message, values = rig.diagnostics()["stream_depth: front"]
+        return "0.0% of the depth is valid" in message and values["valid ratio"] == "0.000"
+
+    rig.probe.wait(said)
+    assert rig.probe.set("front.min_depth", 0).successful
+
+
+def test_there_is_nothing_to_calibrate_without_measurements(rig: Rig) -> None:
+    for name in ("calibrate", "left/calibrate"):
+        answer = rig.probe.trigger(name)
+        assert not answer.success
+        assert "left: metric_source is 'none', which measures nothing" in answer.message
+
+
+def test_the_log_level_can_be_set(rig: Rig) -> None:
+    level = LoggerLevel(name="stream_depth", level=LoggerLevel.LOG_LEVEL_INFO)
+    request = SetLoggerLevels.Request(levels=[level])
+    assert rig.probe.call(SetLoggerLevels, "set_logger_levels", request).results[0].successful
+
+
+def test_another_node_of_the_same_name_is_a_problem(rig: Rig) -> None:
+    twin = rclpy.create_node("stream_depth", context=rig.probe.context)
+    text = "1 other node is called /stream_depth too"
+    rig.probe.wait(lambda: text in rig.diagnostics()["stream_depth"][0])
+    twin.destroy_node()
+    rig.node.wait_log(rf"WARN\].*{text}")
+
+
+def test_an_unknown_lens_costs_the_intrinsics_only(rig: Rig) -> None:
+    info = camera_info()
+    info.distortion_model, info.d = "of_a_stranger", [0.1, 0.2, 0.3]
+    rig.probe.publish("/left/camera_info", stamped(info, 1))
+    reason = "'of_a_stranger' with 3 coefficients cannot be undone"
+
+    def warned() -> bool:
+        rig.play("left", frames(1))
+        return reason in rig.node.log
+
+    rig.probe.wait(warned)
+    rig.reset()
+    assert_close(as_depth(rig.play("left", frames(1))[0]), alone(frames(1))[0])
 
 
 def test_small_steps_back_are_no_reset(rig: Rig) -> None:
@@ -245,6 +378,9 @@ def test_diagnostics_tell_the_state_of_the_node_and_of_each_camera(rig: Rig) -> 
     assert list(found) == ["stream_depth", "stream_depth: front", "stream_depth: left"]
     values = found["stream_depth"][1]
     assert (values["model"], values["state"], values["device"]) == ("tiny", "active", "cpu")
+    hardware = {s.name: s.hardware_id for s in rig.probe.received["/diagnostics"][-1].status}
+    assert hardware["stream_depth: left"] == "/left/image"
+    assert hardware["stream_depth"].endswith(" cpu")
     front = found["stream_depth: front"][1]
     assert front["image topic"] == "/front/image"
     assert int(front["published"]) >= 2

@@ -97,6 +97,10 @@ def test_the_states_of_a_managed_node(setup: Setup) -> None:
     assert "model 'nothing' is unknown" in node.wait_log("cannot configure.*")
     assert probe.state() == "unconfigured"
     assert probe.set("model", "tiny").successful
+    assert probe.set("device", "cuda:99").successful
+    assert not probe.change("configure")
+    node.wait_log("cannot configure: no device 'cuda:99' here")
+    assert probe.set("device", "cpu").successful
     assert probe.change("configure")
     assert probe.state() == "inactive"
     refused = probe.set("model", "other")

@@ -140,6 +140,14 @@ def test_reference_topic_turns_relative_depth_into_metres(bench: Bench) -> None:
     assert int(value(bench, "points")) >= 10
     assert math.isfinite(float(value(bench, "spread")))
 
+    answer = call(client, "calibrate")
+    assert answer.success
+    assert f"until then {scale:.4g} stays in force" in answer.message
+    assert np.isfinite(depth_of(client.result(client.send(picture)))).any()
+    client.wait(lambda: "before the calibration that was asked for" in bench.statuses[-1].message)
+    client.wait(lambda: calibrated() and bench.statuses[-1].level == DiagnosticStatus.OK)
+    scale = bench.scales[-1]
+
     client.reset()
     kept = depth_of(client.result(client.send(picture)))
     assert np.isfinite(kept).any()

@@ -285,6 +285,27 @@ def test_an_unusable_camera_info_is_named_and_ignored(
     lossless[0].wait_log(rf"WARN\].*/camera_info: {reason}")
 
 
+def test_twelve_bits_in_sixteen_are_said_and_can_be_told(
+    lossless: tuple[NodeProcess, Client], client: Client
+) -> None:
+    grey = frames(1)[0][..., 0]
+    expected = play_one(client, image_message(np.repeat(grey[..., None], 3, axis=2)))
+    values = np.rint(grey * (4095 / 255)).astype("<u2")
+    twelve = Image(height=36, width=48, encoding="mono16", step=96)
+    twelve.data = array.array("B", values.tobytes())
+    client.reset()
+    assert play_one(client, twelve) != expected
+    lossless[0].wait_log(r"WARN\].*/image: the values of 'mono16' are below 4096.*image_bits:=12")
+    assert client.set_parameter("image_bits", 12).successful
+    client.reset()
+    assert play_one(client, twelve) == expected
+    assert client.set_parameter("image_bits", 16).successful
+
+
+def play_one(client: Client, message: Image) -> bytes:
+    return bytes(client.result(client.send_message(message))["depth/image"].data)
+
+
 def test_another_resolution_resets_the_stream(client: Client) -> None:
     first = depth_bytes(play(client, frames(2)))
     other = play(client, frames(1, 24, 32))[0]["depth/image"]
@@ -499,6 +520,10 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
         stamps.append(client.send_message(message))
     broken = CompressedImage(format="png", data=array.array("B", b"no picture"))
     client.send_message(broken)
+    noisy = np.random.default_rng(0).integers(0, 256, (36, 48, 3), np.uint8)
+    whole = cv2.imencode(".jpg", noisy)[1].tobytes()
+    damaged = whole[: len(whole) // 2] + b"\xff\xd9"
+    client.send_message(CompressedImage(format="jpeg", data=array.array("B", damaged)))
     bomb = CompressedImage(format="png", data=array.array("B", png(60_000, 60_000)))
     client.send_message(bomb)
     client.settle()
@@ -507,6 +532,8 @@ def test_compressed_images_and_waiting_for_camera_info(graph: Graph) -> None:
     matrix = np.reshape(camera_info().k, (3, 3))
     assert depth_bytes([client.result(s) for s in stamps]) == offline(images, matrix)
     node.wait_log(r"WARN\].*/front/image/compressed: .*neither JPEG nor PNG")
+    node.wait_log(r"WARN\].*/front/image/compressed: the JPEG is damaged: Corrupt JPEG data")
+    assert not re.search(r"^Corrupt JPEG", node.log, re.MULTILINE)
     node.wait_log(r"WARN\].*/front/image/compressed: .*60000 x 60000 pixels; at most")
     assert node.end() == 0
 
