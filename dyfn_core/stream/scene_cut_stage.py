@@ -12,6 +12,7 @@ from dyfn_core.stream.resets import SCENE_CUT
 from dyfn_core.stream.scene_cut import CutState, SceneCutDetector
 from dyfn_core.stream.stages import StreamStage
 
+_APART = 0.09  # seconds between looks at pictures that are skipped; from 0.3 on, motion matters
 Place = Callable[[Frame], Frame]
 
 
@@ -51,8 +52,10 @@ class SceneCutStage(StreamStage):
         return SCENE_CUT if cut or passed else None
 
     def skipped(self, frame: Frame) -> None:
-        """See StreamStage."""
-        self._passed |= self._look(frame, lambda: None)
+        """See StreamStage. Of many pictures some are enough."""
+        last = self._detector.state.stamp
+        if last is None or frame.stamp is None or not 0 <= frame.stamp - last < _APART:
+            self._passed |= self._look(frame, lambda: None)
 
     def _look(self, frame: Frame, pose: Callable[[], np.ndarray | None]) -> bool:
         threshold = self._threshold()

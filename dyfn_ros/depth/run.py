@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -143,6 +143,12 @@ def _frames(
 ) -> Outcome:
     start, frames, withheld = time.perf_counter(), 0, 0
     origins: Counter[str] = Counter()
+
+    def look(frame: SourceFrame) -> None:
+        with suppress(RecordingError):  # it is not worked on
+            session.skip(Frame(camera.apply(frame)[0], frame.stamp))
+
+    source.between = look
     bar = tqdm(source.frames, total=source.expected, unit="frame", file=sys.stderr)
     with bar:
         for frame in bar:

@@ -56,6 +56,7 @@ class DepthSource:
         expected: How many; None: not known.
         losses: What could not be read, with how often; complete after the last frame.
         live: Reads a camera or an address; None: a file.
+        between: Told each frame that the stride leaves out, in its place.
     """
 
     kind: Kind
@@ -65,6 +66,7 @@ class DepthSource:
     expected: int | None
     losses: Counter[str] = field(default_factory=Counter)
     live: LiveCapture | None = None
+    between: Callable[[SourceFrame], None] = lambda frame: None
 
 
 def open_source(
@@ -88,12 +90,22 @@ def open_source(
     else:
         found = _files(Path(text), reading)
     _refuse_idle(reading, found.kind)
-    found.frames = islice(found.frames, 0, None, reading.stride)
+    found.frames = _strided(found, found.frames, reading.stride)
     found.frames = islice(found.frames, reading.max_frames)
     if found.expected is not None:
         available = math.ceil(found.expected / reading.stride)
         found.expected = min(available, reading.max_frames or available)
     return found
+
+
+def _strided(
+    source: DepthSource, frames: Iterator[SourceFrame], stride: int
+) -> Iterator[SourceFrame]:
+    for index, frame in enumerate(frames):
+        if index % stride:
+            source.between(frame)
+        else:
+            yield frame
 
 
 def _refuse_idle(reading: Reading, kind: Kind) -> None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from itertools import islice
 from typing import Any
 
 from dyfn_core.metric.references import Reference
@@ -104,15 +103,27 @@ class SourceReader:
         self._remedies = replace(REMEDIES, stamps="") if source.stamps == "log" else REMEDIES
         self._plausibility = Plausibility(self.expected, self._remedies)
 
-    def frames(self) -> Iterator[RecordedFrame]:
-        """Every frame asked for, in the recording's order."""
+    def frames(
+        self, between: Callable[[RecordedFrame], None] = lambda frame: None
+    ) -> Iterator[RecordedFrame]:
+        """Every frame asked for, in the recording's order.
+
+        Args:
+            between: Told each frame that the stride leaves out, in its place.
+        """
         self._plausibility = Plausibility(self.expected, self._remedies)
+        stride, count = self._source.stride, 0
         with closing(self.recording.frames()) as every:
-            strided = islice(every, 0, None, self._source.stride)
-            for frame in islice(strided, self._source.max_frames):
+            for index, frame in enumerate(every):
+                if index % stride:
+                    between(frame)
+                    continue
                 stamp, camera = frame.stamp_ns, frame.camera_matrix
                 self._plausibility.push(frame.image, frame.depth, stamp, camera)
                 yield frame
+                count += 1
+                if count == self._source.max_frames:
+                    return
 
     def doubts(self, scored: int) -> list[str]:
         """What makes the scores of the frames implausible, a sentence each.

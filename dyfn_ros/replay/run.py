@@ -128,7 +128,7 @@ def _evaluate(
         reader.expected, outputs.depth_max, scored_quantity(model.quantity)
     )
     frames = tqdm(
-        reader.frames(),
+        reader.frames(runner.skip),
         total=reader.expected,
         unit="frame",
         file=sys.stderr,

@@ -81,8 +81,7 @@ class StreamRunner:
         """
         for frame in frames:
             start = time.perf_counter()
-            seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
-            stamp = seconds + nanoseconds * 1e-9
+            stamp = _seconds(frame)
             if self._references is not None:
                 for when, reference in self._references.before(frame):
                     self._session.add_reference(when, reference)
@@ -100,6 +99,11 @@ class StreamRunner:
             if prediction.reset and len(self._reset_lines) < _RESET_LINES:
                 self._reset_lines.append(self._session.last_reset)
             yield RunFrame(frame, prediction, stamp, time.perf_counter() - start)
+
+    def skip(self, frame: RecordedFrame) -> None:
+        """A frame between the last one and the next that is not worked on: it may begin another
+        scene."""
+        self._session.skip(Frame(frame.image, _seconds(frame), frame_id=frame.frame_id))
 
     @property
     def metres_per_unit(self) -> float | None:
@@ -146,6 +150,11 @@ class StreamRunner:
         """Measurements and poses that could not be read, with how often."""
         found = {} if self._poses is None else self._poses.losses()
         return found | ({} if self._references is None else self._references.losses())
+
+
+def _seconds(frame: RecordedFrame) -> float:
+    seconds, nanoseconds = divmod(frame.stamp_ns, 1_000_000_000)
+    return seconds + nanoseconds * 1e-9
 
 
 def _check_folder(state_file: str) -> None:

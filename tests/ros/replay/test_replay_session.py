@@ -8,6 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
@@ -24,6 +25,7 @@ from dyfn_ros.replay.cli import main
 from dyfn_ros.replay.jobs import ALL, PARTIAL, UNUSABLE
 from dyfn_ros.replay.options import parse, parser
 from dyfn_ros.replay.settings import Run, SessionOptions
+from tests.core.stream.test_scene_cut import scene, seen
 from tests.support.rgbd_frames import CAMERA, SIZE, rgbd
 from tests.support.tiny_model import load_tiny
 
@@ -309,3 +311,19 @@ def test_a_state_that_cannot_be_used_is_one_line(
     state = ["--state-file", str(tmp_path / "state"), "--save-state"]
     assert main([*several, *state], load_tiny) == UNUSABLE
     assert "for one recording" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_what_the_stride_leaves_out_is_looked_at_for_scene_cuts(tmp_path: Path, cut: bool) -> None:
+    """Frames 0.6 s apart have nothing in common by the camera's motion alone."""
+    path = tmp_path / "walk"
+    views = [seen(scene(7 + (cut and index > 13), 960), 30 * (index % 22)) for index in range(22)]
+    frames = [
+        FrameToRecord(cv2.resize(view, (96, 72)), None, CAMERA, None, 50 + index / 10)
+        for index, view in enumerate(views)
+    ]
+    write_rgbd_recording(path, frames, jpeg_quality=None)
+    assert run(path, tmp_path / "out", "--stride", "6") in (ALL, PARTIAL)
+    found = metrics(tmp_path / "out")
+    assert found["resets"] == ({"scene cut": 1} if cut else {})
+    assert found["frames"] == 4
