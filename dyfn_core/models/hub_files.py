@@ -123,7 +123,14 @@ def fetch(repo: str, file: str, wanted: str = "") -> Path:
     by_hand = model_folder() / repo / file
     if by_hand.is_file():
         return by_hand
-    from huggingface_hub import constants, hf_hub_download, hf_hub_url, try_to_load_from_cache
+    from huggingface_hub import (
+        constants,
+        get_hf_file_metadata,
+        get_token,
+        hf_hub_download,
+        hf_hub_url,
+        try_to_load_from_cache,
+    )
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 
     cached = try_to_load_from_cache(repo, file)
@@ -131,6 +138,8 @@ def fetch(repo: str, file: str, wanted: str = "") -> Path:
         return Path(cached)
     logger.info("fetching %s of %s from the Hub", file, repo)
     try:
+        # Asked once first: without a network hf_hub_download tries again for 25 s.
+        get_hf_file_metadata(hf_hub_url(repo, file), token=get_token(), timeout=ANSWER)
         return Path(hf_hub_download(repo_id=repo, filename=file, etag_timeout=ANSWER))
     except Exception as error:  # many kinds, by version: no network, no such file, no access
         absent = isinstance(error, EntryNotFoundError)

@@ -16,6 +16,7 @@ from dyfn_core.models.checkpoints import load_model, save_model
 from dyfn_core.models.depth_anything import DepthAnythingConfig, DepthAnythingModel
 from dyfn_core.models.mini import MiniConfig, MiniModel
 from dyfn_core.models.moge import MoGeConfig, MoGeModel
+from tests.support.bases import small_da3, small_moge2
 from tests.support.made_frames import write_data_set
 
 RUN: dict[str, Any] = {
@@ -54,6 +55,10 @@ def tiny(family: str) -> GeometryModel:
                 remap_output="exp",
             )
         )
+    if family == "moge2":
+        return small_moge2()
+    if family == "da3":
+        return small_da3("mono")
     made = DepthAnythingModel(DepthAnythingConfig())
     torch.nn.init.constant_(made.depth_head.scratch.output_conv2[2].bias, 0.5)  # type: ignore[arg-type]
     return made
@@ -75,7 +80,7 @@ def train(folder: Path, data: Path, family: str, objective: dict[str, Any]) -> l
     return [json.loads(line) for line in (folder / "run" / "log.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("family", ["mini", "moge", "dav2"])
+@pytest.mark.parametrize("family", ["mini", "moge", "moge2", "dav2", "da3"])
 def test_base_is_trained_on_and_stays_as_it_was(data: Path, family: str, tmp_path: Path) -> None:
     kind = "disparity" if family == "dav2" else "terms"
     log = train(tmp_path, data, family, {"kind": kind, "decoded": 3, "windows": [1, 2]})
@@ -88,7 +93,7 @@ def test_base_is_trained_on_and_stays_as_it_was(data: Path, family: str, tmp_pat
     assert all(bool(after[key].any()) for key in moved)
     assert moved
     assert trained.stabilizer is not None
-    assert trained.stabilizer.config.pool == (4 if family == "dav2" else 1)
+    assert trained.stabilizer.config.pool == (4 if family in ("dav2", "da3") else 1)
     (step, *_) = [line for line in log if line["group"] == "train"]
     names = {"ssi", "temporal"} if family == "dav2" else {"frame", "temporal", "align_first"}
     assert names <= set(step)
