@@ -22,6 +22,7 @@ setup(
         (SHARE, ["package.xml"]),
         (f"{SHARE}/config", files("config")),
         (f"{SHARE}/config/cameras", files("config/cameras")),
+        (f"{SHARE}/config/recipes", files("config/recipes")),
         (f"{SHARE}/launch", files("launch")),
         (f"{SHARE}/bags/demo", files("bags/demo")),
     ],

@@ -16,6 +16,8 @@ CONFIG = PathJoinSubstitution([FindPackageShare("dyfn_ros"), "config"])
 ARGUMENTS = {
     "image": ("image", "Topic of the colour images; the compressed one is beside it."),
     "camera_info": ("camera_info", "Topic of their CameraInfo."),
+    "odometry": ("odometry", "Topic of the robot's motion, with metric_source: odometry."),
+    "reference": ("reference", "Topic of measured distances, with metric_source: reference."),
     "namespace": ("", "Namespace of the node."),
     "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
     "autostart": ("true", "Configure and activate at start; false: leave it to a manager."),
@@ -24,6 +26,7 @@ ARGUMENTS = {
     "frame": ("camera", "RViz: the images' frame_id, or a frame that tf connects with it."),
 }
 
+INPUTS = ("image", "camera_info", "odometry", "reference")
 SHOWN = ("stream_depth/depth/image", "stream_depth/points")  # by stream_depth.rviz
 
 
@@ -50,7 +53,7 @@ def generate_launch_description() -> LaunchDescription:
             LaunchConfiguration("params_file"),
             {"model": LaunchConfiguration("model"), **flags},
         ],
-        remappings=[("image", image), ("camera_info", LaunchConfiguration("camera_info"))],
+        remappings=[(name, LaunchConfiguration(name)) for name in INPUTS],
         output="screen",
     )
     view = PathJoinSubstitution([CONFIG, "stream_depth.rviz"])

@@ -48,6 +48,7 @@ def test_everything_is_where_ros_looks_for_it(install: Path) -> None:
     share = install / "share/dyfn_ros"
     names = ["launch/stream_depth.launch.py", "launch/stream_depth_cameras.launch.py"]
     names += ["package.xml", "config/stream_depth.yaml", "config/cameras/realsense.yaml"]
+    names += ["config/recipes/stream_depth_nav2.yaml"]
     for name in names:
         assert (share / name).is_file(), name
     assert (install / "share/ament_index/resource_index/packages/dyfn_ros").is_file()

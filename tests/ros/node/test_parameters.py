@@ -27,8 +27,14 @@ def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
     }
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "config/cameras").glob("*")), ids=lambda p: p.stem)
-def test_a_cameras_file_sets_parameters_that_are_allowed(path: Path) -> None:
+NODE_FILES = [
+    *sorted((ROOT / "config/cameras").glob("*")),
+    *sorted((ROOT / "config/recipes").glob("stream_depth*.yaml")),
+]
+
+
+@pytest.mark.parametrize("path", NODE_FILES, ids=lambda p: p.stem)
+def test_a_file_of_the_node_sets_parameters_that_are_allowed(path: Path) -> None:
     ((nodes, content),) = yaml.safe_load(path.read_text()).items()
     assert nodes == "/**/stream_depth"
     values = {"use_sim_time": False, **content["ros__parameters"]}
