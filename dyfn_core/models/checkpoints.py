@@ -34,6 +34,7 @@ from dyfn_core.models.hub_files import model_folder as model_folder
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.models.moge2 import MoGe2Model
+from dyfn_core.models.undrawn import Undrawn
 
 MODEL_TYPES: dict[str, type[GeometryModel]] = {
     "depth_anything_3": DepthAnything3Model,
@@ -104,10 +105,11 @@ def _check_digest(path: Path, expected: str) -> None:
 
 def build_model(checkpoint: Checkpoint, source: str) -> GeometryModel:
     """Checkpoint -> model in eval mode. Raises CheckpointError that names `source`."""
-    with torch.device("meta"):  # the weights replace every parameter: no need to draw them first
+    with torch.device("meta"), Undrawn():  # the weights replace every parameter
         model = empty_model(checkpoint.config, source)
     if {name for name, _ in model.named_buffers()} - set(model.state_dict()):
-        model = empty_model(checkpoint.config, source)
+        with Undrawn():
+            model = empty_model(checkpoint.config, source)
     load_weights(model, checkpoint.weights, source, checkpoint.official)
     return model.eval()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from dyfn_core.models import CheckpointError, checkpoints, load_model, save_mode
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
+from tests.support.bases import small_da3
 
 Official = dict[str, Any]
 
@@ -333,3 +336,24 @@ def test_a_missing_file_in_a_folder_that_is_here_is_not_looked_for_on_the_hub(
     monkeypatch.setattr("huggingface_hub.hf_hub_download", lambda **_: pytest.fail("asked"))
     with pytest.raises(FileNotFoundError, match="no file of that path"):
         load_model("runs/base/model.safetensors")
+
+
+def test_loading_draws_no_random_weights(tmp_path: Path) -> None:
+    saved = small_da3("mono")  # has a buffer outside its state dict, so it is made on the CPU
+    save_model(saved, tmp_path / "model.safetensors")
+    before = torch.get_rng_state()
+    loaded = load_model(tmp_path / "model.safetensors").state_dict()
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(loaded[key], value) for key, value in saved.state_dict().items())
+
+
+def test_a_first_frame_needs_no_compiler() -> None:
+    """Draws on the meta device import it, which takes longer than loading and the frame."""
+    code = (
+        "import sys, numpy, dyfn_core\n"
+        "stream = dyfn_core.DepthStream(dyfn_core.load_model('dyfn-mini'), num_tokens=24)\n"
+        "stream.push(numpy.full((48, 64, 3), 128, numpy.uint8))\n"
+        "print([name for name in ('torch._dynamo', 'sympy') if name in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout == "[]\n"
