@@ -4,12 +4,12 @@ One camera; may be included by other launch files. For an installation with ROS 
 it, run `stream_depth --ros-args -r image:=...`.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+import yaml
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 CONFIG = PathJoinSubstitution([FindPackageShare("dyfn_ros"), "config"])
@@ -19,15 +19,34 @@ ARGUMENTS = {
     "odometry": ("odometry", "Topic of the robot's motion, with metric_source: odometry."),
     "reference": ("reference", "Topic of measured distances, with metric_source: reference."),
     "namespace": ("", "Namespace of the node."),
-    "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
-    "autostart": ("true", "Configure and activate at start; false: leave it to a manager."),
-    "use_sim_time": ("false", "Take the time from /clock."),
+    "model": ("", "Bundled model's name, checkpoint file, or Hub id; empty: the file's."),
+    "autostart": ("", "false: leave the states to a manager; empty: as the file says."),
+    "use_sim_time": ("", "true: take the time from /clock; empty: as the file says."),
     "rviz": ("false", "Start RViz with image, depth and cloud."),
     "frame": ("camera", "RViz: the images' frame_id, or a frame that tf connects with it."),
 }
 
 INPUTS = ("image", "camera_info", "odometry", "reference")
+PARAMETERS = ("model", "autostart", "use_sim_time")  # before what the parameter file says
 SHOWN = ("stream_depth/depth/image", "stream_depth/points")  # by stream_depth.rviz
+
+
+def node(context: LaunchContext) -> list[Node]:
+    given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
+    values = {name: value for name, value in given.items() if value}
+    for name in values:
+        if name != "model":
+            values[name] = yaml.safe_load(values[name])
+    return [
+        Node(
+            package="dyfn_ros",
+            executable="stream_depth",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[LaunchConfiguration("params_file"), *([values] if values else [])],
+            remappings=[(name, LaunchConfiguration(name)) for name in INPUTS],
+            output="screen",
+        )
+    ]
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -38,31 +57,20 @@ def generate_launch_description() -> LaunchDescription:
     params_file = DeclareLaunchArgument(
         "params_file",
         default_value=PathJoinSubstitution([CONFIG, "stream_depth.yaml"]),
-        description="Parameter file of the node; config/cameras has some for usual cameras.",
+        description="The node's parameter file: config/cameras and config/recipes have some.",
     )
-    image = LaunchConfiguration("image")
-    flags = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=bool)
-        for name in ("autostart", "use_sim_time")
-    }
-    node = Node(
-        package="dyfn_ros",
-        executable="stream_depth",
-        namespace=LaunchConfiguration("namespace"),
-        parameters=[
-            LaunchConfiguration("params_file"),
-            {"model": LaunchConfiguration("model"), **flags},
-        ],
-        remappings=[(name, LaunchConfiguration(name)) for name in INPUTS],
-        output="screen",
-    )
-    view = PathJoinSubstitution([CONFIG, "stream_depth.rviz"])
     rviz = Node(
         package="rviz2",
         executable="rviz2",
         namespace=LaunchConfiguration("namespace"),  # relative names are then the node's
-        arguments=["-d", view, "-f", LaunchConfiguration("frame")],
-        remappings=[("/camera/image_raw", image), *((f"/{topic}", topic) for topic in SHOWN)],
+        arguments=[
+            *("-d", PathJoinSubstitution([CONFIG, "stream_depth.rviz"])),
+            *("-f", LaunchConfiguration("frame")),
+        ],
+        remappings=[
+            ("/camera/image_raw", LaunchConfiguration("image")),
+            *((f"/{topic}", topic) for topic in SHOWN),
+        ],
         condition=IfCondition(LaunchConfiguration("rviz")),
     )
-    return LaunchDescription([*declared, params_file, node, rviz])
+    return LaunchDescription([*declared, params_file, OpaqueFunction(function=node), rviz])

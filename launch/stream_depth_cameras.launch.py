@@ -16,7 +16,7 @@ ARGUMENTS = {
     "cameras": ("[front, left]", "Names of the cameras, as a YAML list."),
     "image": ("image_raw", "Their images, below /CAMERA/."),
     "camera_info": ("camera_info", "Their CameraInfos, below /CAMERA/."),
-    "model": ("dyfn-mini", "Bundled model's name, checkpoint file, or Hub id."),
+    "model": ("", "Bundled model's name, checkpoint file, or Hub id; empty: the file's."),
     "params_file": ("", "Parameter file of the node, such as config/cameras/two_cameras.yaml."),
     "rviz": ("false", "Start an RViz for each camera, with its image, depth and cloud."),
     "frame": ("camera", "RViz: a frame that tf connects with the frame_id of the images."),
@@ -28,6 +28,7 @@ def nodes(context: LaunchContext) -> list[Node]:
     values = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     cameras = [str(name) for name in yaml.safe_load(values["cameras"])]
     files = [values["params_file"]] if values["params_file"] else []
+    own = {"cameras": cameras, **({"model": values["model"]} if values["model"] else {})}
     remappings = [
         (f"{camera}/{ours}", f"/{camera}/{values[theirs]}")
         for camera in cameras
@@ -36,7 +37,7 @@ def nodes(context: LaunchContext) -> list[Node]:
     node = Node(
         package="dyfn_ros",
         executable="stream_depth",
-        parameters=[*files, {"cameras": cameras, "model": values["model"]}],
+        parameters=[*files, own],
         remappings=remappings,
         output="screen",
     )

@@ -49,11 +49,6 @@ def test_a_file_of_the_node_sets_parameters_that_are_allowed(path: Path) -> None
     assert all(SPECS[name].per_camera for camera in own.values() for name in camera)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "launch").glob("*.py")), ids=lambda p: p.stem)
-def test_a_launch_file_compiles(path: Path) -> None:
-    compile(path.read_text(), str(path), "exec")
-
-
 def test_manual_and_parameter_file_are_written_from_the_table() -> None:
     """Run `python -m dyfn_ros.node.parameters.docs` after a change of the table."""
     manual = (ROOT / "docs/node.md").read_text()
