@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | lint | coverage | docs | bench | wheel | gpu-train    (see README.md)
+# make setup | demo | test | test-fast | faults | lint | coverage | docs | bench | wheel | gpu-train    (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test test-fast coverage lint docs bench wheel gpu-train clean
+.PHONY: setup demo test test-fast faults coverage lint docs bench wheel gpu-train clean
 
 setup: $(READY)
 
@@ -25,6 +25,10 @@ test: $(READY)
 
 test-fast: $(READY)
 	$(BIN)/python -m pytest -m "not slow"
+
+# Does every fault of docs/faults.md to the node, and writes what came of it there.
+faults: $(READY)
+	$(BIN)/python -m tests.support.faults.table --write
 
 coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import rclpy
@@ -24,12 +24,16 @@ def pinhole(name: str, device: str) -> GeometryModel:
 
 
 @contextmanager
-def made_node(domain: dict[str, str], arguments: Sequence[str] = ()) -> Iterator[StreamDepthNode]:
+def made_node(
+    domain: dict[str, str],
+    arguments: Sequence[str] = (),
+    load: Callable[[str, str], GeometryModel] = pinhole,
+) -> Iterator[StreamDepthNode]:
     """Unconfigured. arguments: what a command line has after --ros-args."""
     context = Context()
     line = ["stream_depth", "--ros-args", *arguments]
     rclpy.init(args=line, context=context, domain_id=int(domain["ROS_DOMAIN_ID"]))
-    node = StreamDepthNode(pinhole, context=context)
+    node = StreamDepthNode(load, context=context)
     try:
         yield node
     finally:
@@ -39,14 +43,21 @@ def made_node(domain: dict[str, str], arguments: Sequence[str] = ()) -> Iterator
 
 @contextmanager
 def running_node(
-    domain: dict[str, str], arguments: Sequence[str] = ()
+    domain: dict[str, str],
+    arguments: Sequence[str] = (),
+    load: Callable[[str, str], GeometryModel] = pinhole,
+    counted: bool = False,
 ) -> Iterator[StreamDepthNode]:
-    """Active, with the pinhole model; a thread runs its callbacks, and none of them failed."""
+    """Active; a thread runs its callbacks.
+
+    counted: callbacks that raise are told to the node, as its process does; else none may.
+    """
     ended, failures = threading.Event(), list[Exception]()
-    with made_node(domain, arguments) as node:
+    with made_node(domain, arguments, load) as node:
         assert node.trigger_configure() == SUCCESS
         assert node.trigger_activate() == SUCCESS
-        executor = NodeExecutor(node, ended.is_set, failures.append)
+        failed = node.callback_failed if counted else failures.append
+        executor = NodeExecutor(node, ended.is_set, failed)
         thread = threading.Thread(target=executor.spin)
         thread.start()
         try:
