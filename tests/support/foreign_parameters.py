@@ -24,3 +24,17 @@ NAV2_SOURCE = _words("""
 """)
 # docs.ros.org, depthimage_to_laserscan of Jazzy.
 LASERSCAN = _words("scan_time range_min range_max scan_height output_frame")
+# rtabmap_ros, branch ros2: rtabmap_sync/doc/rgbd_sync.md and rtabmap_slam/doc/rtabmap.md.
+RGBD_SYNC = _words("""
+    approx_sync approx_sync_max_interval topic_queue_size sync_queue_size qos qos_camera_info
+    depth_scale decimation compressed_rate depth_compression_format image_transport depth_transport
+""")
+RTABMAP = _words("""
+    subscribe_rgbd subscribe_depth subscribe_rgb frame_id odom_frame_id wait_for_transform
+    database_path delete_db_on_start publish_tf approx_sync topic_queue_size sync_queue_size
+""")
+# introlab.github.io/rtabmap: RTAB-Map's own, which are strings.
+RTABMAP_OWN = _words("""
+    RGBD/LinearUpdate RGBD/AngularUpdate Reg/Force3DoF Grid/RangeMax Grid/MaxGroundHeight
+    Grid/NormalsSegmentation Rtabmap/DetectionRate
+""")

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import yaml
 from sensor_msgs.msg import CameraInfo
 
 from dyfn_ros.messages.camera_info import camera_info_message
@@ -33,12 +34,21 @@ MADE = MappingProxyType(
 )
 
 
+def parameters_of(file: Path, node: str) -> dict[str, Any]:
+    """Of one node of a parameter file; its name may have wildcards before it."""
+    content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    (found,) = [one for name, one in content.items() if name.rsplit("/", 1)[-1] == node]
+    values: dict[str, Any] = found["ros__parameters"]
+    return values
+
+
 class RecipeStream:
     """A node that runs a recipe, and what a camera and its listeners do."""
 
     def __init__(self, node: StreamDepthNode, probe: Probe, image: str, info: str) -> None:
         self.node, self.probe = node, probe
-        self._image, self._info, self._stamp = image, info, 0
+        self._image, self._info = image, info
+        self.stamp = 0  # of the newest frame, nanoseconds
 
     def info(self) -> CameraInfo:
         """Of the made camera."""
@@ -51,9 +61,9 @@ class RecipeStream:
                 self.probe.listen(topic, kind)
         deadline = self.probe.node.get_clock().now().nanoseconds + int(DEADLINE * 1e9)
         while self.probe.node.get_clock().now().nanoseconds < deadline:
-            self._stamp += STEP
-            self.probe.publish(self._info, stamped(self.info(), self._stamp, OPTICAL_FRAME))
-            message = stamped(image_message(picture), self._stamp, OPTICAL_FRAME)
+            self.stamp += STEP
+            self.probe.publish(self._info, stamped(self.info(), self.stamp, OPTICAL_FRAME))
+            message = stamped(image_message(picture), self.stamp, OPTICAL_FRAME)
             self.probe.publish(self._image, message)
             self.probe.spin_until(lambda: len(self._answer(kinds)) == len(kinds), 0.3)
             if len(answer := self._answer(kinds)) == len(kinds):
@@ -67,7 +77,7 @@ class RecipeStream:
             topic: message
             for topic in kinds
             for message in received[topic]
-            if stamp_of(message) == self._stamp
+            if stamp_of(message) == self.stamp
         }
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from ament_index_python import get_packages_with_prefixes
 
 from dyfn_ros.node.parameters.table import SPECS
 from tests.support.launch_stand_in import ROOT, Process, declared, processes
@@ -31,6 +32,9 @@ def test_it_runs_under_ros_launch(path: Path, tmp_path: Path) -> None:
     """The whole command, until the node waits for images; it ends with code 0."""
     if find_spec("launch_ros") is None or shutil.which("ros2") is None:
         pytest.skip("ROS launch is not installed: no Python wheels have launch and launch_ros")
+    missing = {one.package for one in processes(path)} - set(get_packages_with_prefixes())
+    if missing:
+        pytest.skip(f"the ROS packages {sorted(missing)} are not installed")
     with own_domain() as domain:
         node = NodeProcess(["ros2", "launch", str(path)], domain, tmp_path)
         node.wait_log("waiting for images on")
