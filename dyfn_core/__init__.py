@@ -1,6 +1,7 @@
 """Streaming monocular geometry: frames of one camera in, point maps that keep one scale out.
 
-Models: `load_model`, `save_model`. One camera over time: `DepthStream` (geometry up to scale), and
+Models: `load_model`, `save_model`; `DyFNModel` with `ModelFacts`, for folders with a model card and
+the Hugging Face Hub. One camera over time: `DepthStream` (geometry up to scale), and
 `StreamSession` with `StreamOptions`, which adds what the ROS 2 node does: scene cuts, metric scale
 from a `PointReference`, `DepthReference` or `ConeReference`, saved state. Several cameras in one
 batch: `push_together`. Values: `Frame` goes in, `Prediction` comes out, `StreamState` is DyFN's
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from dyfn_core.models import CheckpointError as CheckpointError
     from dyfn_core.models import load_model as load_model
     from dyfn_core.models import save_model as save_model
+    from dyfn_core.models.model_card import ModelFacts as ModelFacts
+    from dyfn_core.models.pretrained import DyFNModel as DyFNModel
     from dyfn_core.prediction import Frame as Frame
     from dyfn_core.prediction import Prediction as Prediction
     from dyfn_core.prediction import StreamState as StreamState
@@ -43,7 +46,9 @@ _HOMES = {
     "ConeReference": "dyfn_core.metric.references",
     "DepthReference": "dyfn_core.metric.references",
     "DepthStream": "dyfn_core.stream.depth_stream",
+    "DyFNModel": "dyfn_core.models.pretrained",
     "Frame": "dyfn_core.prediction",
+    "ModelFacts": "dyfn_core.models.model_card",
     "PointReference": "dyfn_core.metric.references",
     "Prediction": "dyfn_core.prediction",
     "StateError": "dyfn_core.stream.saving",
@@ -60,7 +65,9 @@ __all__ = [
     "ConeReference",
     "DepthReference",
     "DepthStream",
+    "DyFNModel",
     "Frame",
+    "ModelFacts",
     "PointReference",
     "Prediction",
     "StateError",

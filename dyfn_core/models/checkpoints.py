@@ -29,7 +29,7 @@ from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_core.models.formats import Checkpoint as Checkpoint
 from dyfn_core.models.formats import CheckpointError as CheckpointError
 from dyfn_core.models.formats import read_checkpoint as read_checkpoint
-from dyfn_core.models.hub_files import is_hub_id, locate
+from dyfn_core.models.hub_files import WEIGHTS, Asked, is_hub_id, locate
 from dyfn_core.models.hub_files import model_folder as model_folder
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
@@ -65,8 +65,8 @@ def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> 
     """A trained model, in eval mode, float32.
 
     Args:
-        name_or_path: "dyfn-mini" (bundled), a file, or a Hub id such as "shawlyu/DyFN" or
-            "Ruicheng/moge-vitl", optionally with "/file".
+        name_or_path: "dyfn-mini" (bundled), a file, a folder with a model.safetensors, or a Hub
+            id such as "shawlyu/DyFN" or "Ruicheng/moge-vitl", optionally with "/file".
         device: a torch device or its name; "auto" takes a GPU if there is one.
 
     Returns:
@@ -91,7 +91,7 @@ def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> 
                 raise FileNotFoundError(f"the bundled model {name!r} is not installed: no {path}")
             _check_digest(path, BUNDLED_SHA256[BUNDLED[name]])
             return build_model(read_checkpoint(path), str(path)).to(device)
-    path = _locate(name)
+    path = find_checkpoint(name)
     return build_model(read_checkpoint(path), str(path)).to(device)
 
 
@@ -227,8 +227,14 @@ def _shape(tensor: Tensor) -> str:
     return "x".join(map(str, tensor.shape)) or "a scalar"
 
 
-def _locate(name: str) -> Path:
+def find_checkpoint(name: str, asked: Asked | None = None) -> Path:
+    """The file that a path, a folder or a Hub id stands for, fetched if need be.
+
+    asked: how the Hub is asked. Raises FileNotFoundError or CheckpointError.
+    """
     path = Path(name).expanduser()
+    if path.is_dir():
+        return path / WEIGHTS
     if path.exists():
         return path
     is_weights = path.suffix in (".pt", ".pth", ".safetensors")
@@ -238,4 +244,4 @@ def _locate(name: str) -> Path:
             f"no model {name!r}: no file of that path, no bundled model "
             f"({', '.join(BUNDLED)}) and no Hub id (owner/name)"
         )
-    return locate(name)
+    return locate(name, asked)

@@ -6,7 +6,10 @@ import json
 import logging
 import os
 import re
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
 from typing import Any
 
 from dyfn_core.models.formats import CheckpointError
@@ -58,31 +61,62 @@ def model_folder() -> Path:
     return Path(chosen) if chosen else Path.home() / ".cache" / "dyfn" / "models"
 
 
-def locate(name: str) -> Path:
+@dataclass(frozen=True)
+class Asked:
+    """How the Hub and its cache are asked, in huggingface_hub's words.
+
+    Attributes:
+        revision: Branch, tag or commit; None: what the cache has of main, else main.
+        cache_dir: Folder of the cache; None: huggingface_hub's own.
+        token: Access token; None: the one that is logged in, False: none.
+        local_files_only: Nothing but the cache is asked.
+        force_download: The cache is not asked.
+    """
+
+    revision: str | None = None
+    cache_dir: str | Path | None = None
+    token: str | bool | None = None
+    local_files_only: bool = False
+    force_download: bool = False
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether a file put there by hand, of an unknown revision, will do."""
+        return self.revision is None and not self.force_download
+
+
+def locate(name: str, asked: Asked | None = None) -> Path:
     """The file with a Hub model's weights, on this machine.
 
     Args:
         name: See is_hub_id.
+        asked: How; None: by the defaults.
 
     Raises:
         CheckpointError: The repository holds something that is not supported; nothing but its
             config.json, a small file, has been downloaded then.
         FileNotFoundError: No such file, or no network; says what to put where.
     """
-    match = _HUB_ID.fullmatch(name)
-    assert match is not None, name
-    repo, file = match["repo"], match["file"]
+    repo, file = hub_parts(name)
+    asked = asked or Asked()
     known = _FILES.get(repo.lower())
     if known is None:
         _refuse_by_name(repo)
     if file or known:
-        return fetch(repo, file or known or "")
+        return fetch(repo, file or known or "", asked=asked)
     by_hand = model_folder() / repo
     for one in (by_hand / WEIGHTS, by_hand / "model.pt"):
-        if one.is_file():
+        if asked.by_hand and one.is_file():
             return one
-    _refuse_by_config(repo, fetch(repo, CONFIG, wanted=WEIGHTS))
-    return fetch(repo, WEIGHTS)
+    _refuse_by_config(repo, fetch(repo, CONFIG, wanted=WEIGHTS, asked=asked))
+    return fetch(repo, WEIGHTS, asked=asked)
+
+
+def hub_parts(name: str) -> tuple[str, str]:
+    """owner/name/file -> owner/name and the file, "" for none. name: see is_hub_id."""
+    match = _HUB_ID.fullmatch(name)
+    assert match is not None, name
+    return match["repo"], match["file"] or ""
 
 
 def _refuse_by_name(repo: str) -> None:
@@ -115,32 +149,28 @@ def _by_file(repo: str) -> str:
     return f"A checkpoint in a supported format is named with its file: {repo}/FILE"
 
 
-def fetch(repo: str, file: str, wanted: str = "") -> Path:
+def fetch(repo: str, file: str, wanted: str = "", asked: Asked | None = None) -> Path:
     """A repository's file: put there by hand, in the Hub's cache, or downloaded.
 
     wanted: what to put by hand where this file cannot be had; "" is the file itself.
     """
+    asked = asked or Asked()
     by_hand = model_folder() / repo / file
-    if by_hand.is_file():
+    if asked.by_hand and by_hand.is_file():
         return by_hand
-    from huggingface_hub import (
-        constants,
-        get_hf_file_metadata,
-        get_token,
-        hf_hub_download,
-        hf_hub_url,
-        try_to_load_from_cache,
-    )
+    from huggingface_hub import hf_hub_download, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 
-    cached = try_to_load_from_cache(repo, file)
-    if isinstance(cached, str):
+    cached = try_to_load_from_cache(repo, file, cache_dir=asked.cache_dir, revision=asked.revision)
+    if isinstance(cached, str) and not asked.force_download:
         return Path(cached)
-    logger.info("fetching %s of %s from the Hub", file, repo)
     try:
-        # Asked once first: without a network hf_hub_download tries again for 25 s.
-        get_hf_file_metadata(hf_hub_url(repo, file), token=get_token(), timeout=ANSWER)
-        return Path(hf_hub_download(repo_id=repo, filename=file, etag_timeout=ANSWER))
+        if not asked.local_files_only:
+            logger.info("fetching %s of %s from the Hub", file, repo)
+            _ask(repo, file, asked)
+        return Path(
+            hf_hub_download(repo_id=repo, filename=file, etag_timeout=ANSWER, **asdict(asked))
+        )
     except Exception as error:  # many kinds, by version: no network, no such file, no access
         absent = isinstance(error, EntryNotFoundError)
         if wanted and absent and not isinstance(error, LocalEntryNotFoundError):
@@ -148,11 +178,53 @@ def fetch(repo: str, file: str, wanted: str = "") -> Path:
                 f"Hub model {repo} is not supported: it has no {file} that says what it is; "
                 f"{_choice()}. {_by_file(repo)}"
             ) from error
-        file = wanted or file
-        raise FileNotFoundError(
-            f"no such file here, and cannot download {file} of Hub model {repo} "
-            f"({type(error).__name__}: {error}). "
-            f"Download {hf_hub_url(repo, file)} on a machine with a network and put it at "
-            f"{model_folder() / repo / file} (or anywhere, and pass its path). "
-            f"The Hub's cache is {constants.HF_HUB_CACHE}"
-        ) from error
+        raise FileNotFoundError(_unavailable(repo, wanted or file, asked, error)) from error
+
+
+def _ask(repo: str, file: str, asked: Asked) -> None:
+    """Raises what the Hub answers, or TimeoutError, within ANSWER seconds.
+
+    Without a network hf_hub_download tries again for 25 s, and a timeout of one connection is
+    neither that of a name's resolution nor that of all addresses behind the name.
+    """
+    from huggingface_hub import constants, get_hf_file_metadata, hf_hub_url
+
+    if constants.HF_HUB_OFFLINE:
+        return  # huggingface_hub says so itself
+    url = hf_hub_url(repo, file, revision=asked.revision)
+    answers: SimpleQueue[Exception | None] = SimpleQueue()
+
+    def ask() -> None:
+        try:
+            get_hf_file_metadata(url, token=asked.token, timeout=ANSWER)
+            answers.put(None)
+        except Exception as error:  # handed to the caller's thread
+            answers.put(error)
+
+    Thread(target=ask, daemon=True).start()
+    try:
+        answer = answers.get(timeout=ANSWER)
+    except Empty:
+        raise TimeoutError(f"no answer within {ANSWER:g} s from {url}") from None
+    if answer is not None:
+        raise answer
+
+
+def _unavailable(repo: str, file: str, asked: Asked, error: Exception) -> str:
+    from huggingface_hub import constants, hf_hub_url
+
+    cache = asked.cache_dir or constants.HF_HUB_CACHE
+    revision = "" if asked.revision is None else f" at revision {asked.revision}"
+    if asked.local_files_only:
+        return (
+            f"no {file} of Hub model {repo}{revision} in the cache {cache}, and local_files_only "
+            "forbids to ask the Hub"
+        )
+    here = model_folder() / repo / file
+    put = f"put it at {here} (or anywhere, and pass its path)" if asked.by_hand else "pass its path"
+    return (
+        f"no such file here, and cannot download {file} of Hub model {repo}{revision} "
+        f"({type(error).__name__}: {error}). "
+        f"Download {hf_hub_url(repo, file, revision=asked.revision)} on a machine with a network "
+        f"and {put}. The Hub's cache is {cache}"
+    )

@@ -313,7 +313,7 @@ def test_hub_download_is_used_when_there_is_a_network(
         return str(path)
 
     monkeypatch.setenv("DYFN_MODELS", str(tmp_path))
-    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_: None)
+    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_, **__: None)
     monkeypatch.setattr("huggingface_hub.get_hf_file_metadata", lambda *_, **__: None)
     monkeypatch.setattr("huggingface_hub.hf_hub_download", download)
     assert isinstance(load_model("shawlyu/DyFN"), MoGeModel)
