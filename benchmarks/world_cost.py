@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from dyfn_worlds.camera.cameras import CameraLens, random_view
-from dyfn_worlds.camera.photographer import SAMPLES, Photographer
+from dyfn_worlds.camera.choices import SAMPLES
+from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.camera.staging import stand
 from dyfn_worlds.generate import RoomWorlds
 from dyfn_worlds.render.occlusion import shade_corners

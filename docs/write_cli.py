@@ -14,9 +14,9 @@ from textwrap import fill
 from dyfn_core.cli import eval as dyfn_eval
 from dyfn_core.cli import train as dyfn_train
 from dyfn_ros.app import options as dyfn_app
-from dyfn_ros.demo import cli as dyfn_demo
+from dyfn_ros.demo import options as dyfn_demo
 from dyfn_ros.depth import options as dyfn_depth
-from dyfn_ros.record import cli as dyfn_record
+from dyfn_ros.record import options as dyfn_record
 from dyfn_ros.replay import options as dyfn_replay
 from dyfn_worlds import cli as dyfn_worlds
 

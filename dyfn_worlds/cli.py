@@ -9,12 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
-from tqdm import tqdm
-
-from dyfn_worlds.camera.cameras import PLACEMENTS, USUAL
-from dyfn_worlds.camera.paths import PACES
-from dyfn_worlds.camera.photographer import SAMPLES
-from dyfn_worlds.generate import MapWorlds, RoomWorlds, ShardJob, render
+from dyfn_worlds.camera.choices import PACES, PLACEMENTS, SAMPLES, USUAL
 
 UNUSABLE, INTERRUPTED = 2, 130
 
@@ -137,7 +132,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.placement != USUAL and options.clip_frames:
         reader.error("--placement is that of views, and --clip-frames asks for clips")
     try:
-        _render(options)
+        from dyfn_worlds.render_shards import execute  # the renderer's libraries: only now
+
+        execute(options)
+    except ModuleNotFoundError:
+        raise  # the entry point names the extra
     except (OSError, ValueError, ImportError) as error:
         print(f"dyfn-worlds: {error}", file=sys.stderr)
         return UNUSABLE
@@ -145,32 +144,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("dyfn-worlds: interrupted; the finished shards stay", file=sys.stderr)
         return INTERRUPTED
     return 0
-
-
-def _render(options: argparse.Namespace) -> None:
-    job = ShardJob(
-        options.worlds,
-        options.shards,
-        options.views,
-        options.clip_frames,
-        options.seed,
-        options.size,
-        options.clip_fps,
-        options.placement,
-        options.pace,
-        options.samples,
-    )
-    if not options.assets.is_dir():
-        raise NotADirectoryError(f"--assets {options.assets}: no such folder")
-    kind = MapWorlds if options.worlds == "maps" else RoomWorlds
-    worlds: MapWorlds | RoomWorlds = kind(options.assets)
-    with tqdm(total=options.shards, unit="shard", file=sys.stderr) as bar:
-
-        def report(line: str) -> None:
-            bar.update()
-            bar.set_postfix_str(line[-60:])
-
-        render(job, worlds, options.out, report)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import USUAL
-from dyfn_worlds.camera.photographer import SAMPLES, Photographer
+from dyfn_worlds.camera.choices import SAMPLES, USUAL
+from dyfn_worlds.camera.photographer import Photographer
 from dyfn_worlds.casting import Cast
 from dyfn_worlds.maps.quake import GameFiles, MapError, load_map
 from dyfn_worlds.render.renderer import Renderer

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -16,9 +18,11 @@ from dyfn_core.cli.arguments import command_parser, renamed
 from dyfn_ros.app import cli as dyfn_app
 from dyfn_ros.app import options as app_options
 from dyfn_ros.demo import cli as dyfn_demo
+from dyfn_ros.demo import options as demo_options
 from dyfn_ros.depth import cli as dyfn_depth
 from dyfn_ros.depth import options as depth_options
 from dyfn_ros.record import cli as dyfn_record
+from dyfn_ros.record import options as record_options
 from dyfn_ros.replay import cli as dyfn_replay
 from dyfn_ros.replay import options as replay_options
 from dyfn_ros.replay.options import parse
@@ -41,8 +45,8 @@ PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
     "dyfn-depth": depth_options.parser,
     "dyfn-app": app_options.parser,
     "dyfn-replay": replay_options.parser,
-    "dyfn-record": dyfn_record.parser,
-    "dyfn-demo": dyfn_demo.parser,
+    "dyfn-record": record_options.parser,
+    "dyfn-demo": demo_options.parser,
     "dyfn-eval": dyfn_eval.parser,
     "dyfn-train": dyfn_train.parser,
     "dyfn-worlds": dyfn_worlds.parser,
@@ -133,6 +137,35 @@ def test_help_can_be_printed(command: str) -> None:
         assert parser.prog in parser.format_help()
 
 
+# Reads a module a line and the words after it; writes what of SLOW its main has imported.
+HELP = """
+import contextlib, importlib, io, sys
+for line in sys.stdin:
+    module, *words = line.split()
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        importlib.import_module(module).main(words)
+    slow = ("torch", "scipy", "matplotlib", "pydantic", "tqdm", "trimesh")
+    print(module, *words[:-1], "usage: " in said.getvalue(), *(m for m in slow if m in sys.modules))
+"""
+
+
+def test_help_comes_without_torch() -> None:
+    lines = [
+        f"{MAINS[parser.prog.split()[0]].__module__} {' '.join(parser.prog.split()[1:])} --help"
+        for command in sorted(PARSERS)
+        for parser in with_sub_commands(PARSERS[command]())
+    ]
+    run = subprocess.run(
+        [sys.executable, "-c", HELP],
+        input="\n".join(lines),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = [f"{' '.join(line.split()[:-1])} True" for line in lines]
+    assert run.stdout.splitlines() == expected
+
+
 def test_one_option_has_one_meaning() -> None:
     """The same words of help wherever an option of these names is, defaults apart."""
     shared = ("--device", "--stride", "--max-frames", "--stabilize", "--controls", "--num-tokens")
@@ -195,7 +228,7 @@ def test_new_names_say_nothing_and_help_hides_the_old(capsys: pytest.CaptureFixt
 def test_the_demo_takes_its_recording_by_the_old_name_too(
     words: list[str], name: str, value: str
 ) -> None:
-    assert getattr(dyfn_demo.parse(words), name).name == value
+    assert getattr(demo_options.parse(words), name).name == value
 
 
 def test_the_page_of_commands_is_current() -> None:

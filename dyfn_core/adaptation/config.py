@@ -6,9 +6,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from dyfn_core.adaptation.defaults import HOLD_BACK, RATE, SEED, STEPS, TEST
 from dyfn_core.training.config import LoopConfig
-
-DECODER = ("none", "last", "all")
 
 
 class AdaptConfig(LoopConfig):
@@ -33,15 +32,16 @@ class AdaptConfig(LoopConfig):
     base: str = "dyfn-mini"
     decoder: Literal["none", "last", "all"] = "none"
     decoder_rate: float = Field(0.3, gt=0)
-    rate: float = Field(10.0, gt=0)
-    hold_back: float = Field(0.25, gt=0, lt=1)
-    test: float = Field(0.0, ge=0, lt=1)
+    rate: float = Field(RATE, gt=0)
+    hold_back: float = Field(HOLD_BACK, gt=0, lt=1)
+    test: float = Field(TEST, ge=0, lt=1)
     clips: int = Field(2, ge=1)
     length: int = Field(8, ge=2)
     most_stride: int = Field(3, ge=1)
     decoded: int = Field(4, ge=2)
     frame_weight: float = Field(0.5, ge=0)
-    steps: int = Field(600, ge=1)
+    steps: int = Field(STEPS, ge=1)
+    seed: int = SEED
     patience: int | None = Field(4, ge=1)
     learning_rate: float = Field(5e-4, gt=0)
     warmup_steps: int = Field(20, ge=0)

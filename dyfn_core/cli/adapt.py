@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.adaptation.config import DECODER, AdaptConfig
+from dyfn_core.adaptation.config import AdaptConfig
 from dyfn_core.adaptation.run import AdaptResult, Compared, adapt
-from dyfn_core.argument_types import above_zero, at_least_one
-from dyfn_core.cli.arguments import Commands, add_model, add_out, described
 from dyfn_core.evaluation.report.html import Cell, Table, text_table
 from dyfn_core.evaluation.report.tables import write_tables
 from dyfn_core.training.config import override, settings_of
@@ -22,73 +20,6 @@ HEADER = (
 )
 # Options that are settings of AdaptConfig.
 SETTINGS = ("decoder", "rate", "hold_back", "test", "steps", "seed")
-
-
-def add_parser(commands: Commands) -> None:
-    """Add the sub-command."""
-    purpose = "adapt a model to recordings with odometry, by triangulated points"
-    command = commands.add_parser(
-        "adapt",
-        help=purpose,
-        description=described(purpose),
-        epilog="Exit status: 0, the model was written; 1, it has not become better, and was not, "
-        "or something is wrong.",
-    )
-    command.add_argument(
-        "recordings",
-        nargs="+",
-        metavar="[KIND=]RECORDING",
-        help="bag, MCAP file or RGB-D folder with poses; with options: "
-        "'{root: PATH, odometry_topic: /odom}'",
-    )
-    add_out(command, "file of the model, NAME.safetensors").metavar = "FILE"
-    add_model(command)
-    _add_learning(command.add_argument_group("what learns"))
-    group = command.add_argument_group("run")
-    group.add_argument(
-        "--run", type=Path, metavar="DIR", help="folder of the run (default: NAME.run beside FILE)"
-    )
-    group.add_argument("--resume", action="store_true", help="go on from the run's checkpoint")
-    group.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting"
-    )
-
-
-def _add_learning(group: argparse._ArgumentGroup) -> None:
-    default = {name: AdaptConfig.model_fields[name].default for name in SETTINGS}
-    add = group.add_argument
-    add(
-        "--decoder",
-        choices=DECODER,
-        help=f"part of the decoder that learns beside DyFN (default: {default['decoder']})",
-    )
-    add(
-        "--rate",
-        type=above_zero,
-        metavar="HZ",
-        help=f"frames a second that are learned from (default: {default['rate']:g})",
-    )
-    add(
-        "--hold-back",
-        type=float,
-        metavar="SHARE",
-        help="of each 20 s, which decides when to stop and whether the model is better "
-        f"(default: {default['hold_back']:g})",
-    )
-    add(
-        "--test",
-        type=float,
-        metavar="SHARE",
-        help="at the end of each recording, which is scored and decides nothing "
-        f"(default: {default['test']:g})",
-    )
-    add(
-        "--steps",
-        type=at_least_one,
-        metavar="N",
-        help=f"at most so many (default: {default['steps']})",
-    )
-    add("--seed", type=int, metavar="N", help=f"of all draws (default: {default['seed']})")
 
 
 def run(options: argparse.Namespace) -> int:

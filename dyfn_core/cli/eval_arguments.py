@@ -19,10 +19,9 @@ from dyfn_core.cli.arguments import (
     add_stride,
     renamed,
 )
-from dyfn_core.evaluation.benchmarks.metres import METRES
-from dyfn_core.evaluation.benchmarks.registry import AUTO, LAYOUTS
+from dyfn_core.evaluation.choices import AUTO, LAYOUTS, METRES
 from dyfn_core.quantities import QUANTITIES
-from dyfn_core.scoring.protocols import FITS, L1
+from dyfn_core.scoring.fits import FITS, L1
 
 
 def add_benchmark(command: argparse.ArgumentParser) -> None:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dyfn_core.argument_types import at_least_one
-from dyfn_core.cli.arguments import Commands, add_stride, described, renamed
+from dyfn_core.cli.experiments_options import LENGTHS
 from dyfn_core.evaluation.empirical_study import draw_grid, statistics_grid
 from dyfn_core.evaluation.variants import EncodedSequence, errors_by_length
 from dyfn_core.experiments.declared import EXPERIMENTS, Experiment, find_experiments
@@ -29,63 +28,7 @@ from dyfn_core.models.controls import ema_control, frozen_control
 from dyfn_core.models.dyfn import DyFN
 from dyfn_core.training.loop.trainer import MODEL_FILE
 
-LENGTHS = (100, 200, 300, 400, 500)
 GRID_FRAMES = 24
-CONFIG = Path("config/train_experiments.yaml")
-OUT = Path("runs/experiments")
-
-
-def add_parser(commands: Commands) -> None:
-    """The sub-command and its options."""
-    text = "the paper's claims, on a base of your own"
-    command = commands.add_parser("experiments", help=text, description=described(text))
-    add = command.add_argument
-    add("name", nargs="*", help="experiments to run (default: all); see --list")
-    add("--list", action="store_true", help="print the experiments and stop")
-    add(
-        "--config",
-        type=Path,
-        default=CONFIG,
-        metavar="FILE",
-        help=f"settings of every run (default: {CONFIG})",
-    )
-    add("--base", metavar="MODEL", help="model whose DyFN is trained, instead of the config's")
-    add(
-        "--out",
-        type=Path,
-        default=OUT,
-        metavar="DIR",
-        help=f"folder for all runs (default: {OUT})",
-    )
-    add("--seeds", type=at_least_one, default=3, metavar="N", help="runs per arm (default: 3)")
-    add("--write", type=Path, metavar="FILE", help="Markdown file to put the tables in")
-    data = add(
-        "--data",
-        dest="recording",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="RGB-D folder to score on; may be given several times",
-    )
-    renamed(command, "--recording", data)
-    add(
-        "--clips",
-        type=at_least_one,
-        default=12,
-        metavar="N",
-        help="held-out clips to score on (default: 12)",
-    )
-    add_stride(command, 4)
-    add(
-        "--lengths",
-        type=at_least_one,
-        nargs="+",
-        default=list(LENGTHS),
-        metavar="N",
-        help=f"frames, for long-sequences (default: {' '.join(map(str, LENGTHS))})",
-    )
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="override a setting")
 
 
 def run(options: argparse.Namespace) -> None:

@@ -10,12 +10,9 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from dyfn_core.argument_types import at_least_one, finite_above_zero
-from dyfn_core.cli.arguments import Commands
-from dyfn_core.cli.data_arguments import add_data_arguments, open_sequence, places
+from dyfn_core.cli.chosen_data import open_sequence, places
 from dyfn_core.data.frames import FrameError, FrameSequence
 from dyfn_core.evaluation.empirical_study import (
-    FACTORS,
     draw_grid,
     grid_ranges,
     statistics_grid,
@@ -26,36 +23,6 @@ from dyfn_core.models.base import GeometryModel, Latent, image_to_batch
 from dyfn_core.models.checkpoints import load_model
 
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
-FRAMES = 24
-
-
-def add_parser(commands: Commands) -> None:
-    """The sub-command and its options; its function is in `run`."""
-    command = commands.add_parser(
-        "study",
-        help="scale the latent's statistics and see what moves",
-        description="The paper's empirical study on the frames of any data, for any model.",
-        epilog="Exit status: 0 done, 3 frames could not be read (the rest was used), 2 unusable.",
-    )
-    add_data_arguments(command)
-    add = command.add_argument_group("study").add_argument
-    add(
-        "--frames",
-        type=at_least_one,
-        default=FRAMES,
-        metavar="N",
-        help=f"study N of the frames, evenly spaced (default: {FRAMES})",
-    )
-    add(
-        "--factors",
-        type=finite_above_zero,
-        nargs="+",
-        default=list(FACTORS),
-        metavar="X",
-        help="factors of mean and deviation "
-        f"(default: {' '.join(f'{factor:g}' for factor in FACTORS)})",
-    )
-    command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dyfn_core.evaluation.choices import FACTORS
 from dyfn_core.evaluation.report.html import Table
 from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.dyfn import EPSILON
-
-FACTORS = (0.5, 0.625, 0.8, 1.0, 1.25, 1.6, 2.0)
 
 
 @dataclass(frozen=True)

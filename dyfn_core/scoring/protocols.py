@@ -11,6 +11,7 @@ import numpy as np
 
 from dyfn_core.geometry.l1_fit import fit_scale_shift
 from dyfn_core.prediction import DEPTH, DISPARITY
+from dyfn_core.scoring.fits import FITS, L1, LEAST_SQUARES
 from dyfn_core.scoring.frame_scores import FrameScore, FrameScores, MetricRows
 from dyfn_core.scoring.metrics import depth_metrics
 from dyfn_core.scoring.samples import Samples
@@ -19,7 +20,6 @@ FARTHEST = 1e4  # metres: depth where aligned disparity is not positive, unless 
 MIN_DEPTH = 1e-3  # truth at or below this (metres) is invalid; aligned depth is clipped to it
 MIN_PIXELS = 16  # frames with fewer scored samples are not scored
 ALL_PIXELS = 1 << 62  # as samples_per_frame and max_samples: nothing is left out
-L1, LEAST_SQUARES = FITS = ("l1", "lstsq")
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,6 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
-from dyfn_core.models.checkpoints import load_model
-
 STABILIZER, SCALE = "stabilizer", "scale"
 METHODS = {STABILIZER: "unrolled", SCALE: "linearized"}
 
@@ -105,6 +103,8 @@ def _move_objective(new: dict[str, Any], method: dict[str, Any]) -> None:
 
 def _kind_for(base: str) -> str:
     """The objective that the base's output asks for, as `dyfn-train stabilizer` chose it."""
+    from dyfn_core.models.checkpoints import load_model  # torch, which --help does without
+
     try:
         return "disparity" if load_model(base).quantity == "disparity" else "terms"
     except (OSError, ValueError):

@@ -20,13 +20,15 @@ def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> 
 
     args: the command line; None takes sys.argv. load: (name, device) -> model; None is load_model.
     """
+    arguments = sys.argv if args is None else list(args)
     end = EndRequest()
     prepare_environment()
     try:
+        _take_own(arguments)
         # Imports that take seconds, here where a signal already has its meaning.
         from dyfn_ros.node.process import run
 
-        code = run(sys.argv if args is None else list(args), load, end)
+        code = run(arguments, load, end)
     except ModuleNotFoundError as error:
         print(f"stream_depth: {missing(error)}", file=sys.stderr)
         end.leave(1)
@@ -34,6 +36,17 @@ def main(args: Sequence[str] | None = None, load: ModelLoader | None = None) -> 
         traceback.print_exc()
         end.leave(1)
     sys.exit(code)  # the middleware frees its shared memory as the interpreter ends
+
+
+def _take_own(arguments: Sequence[str]) -> None:
+    """--help, and words that nobody knows, end the process here, before torch is imported."""
+    from dyfn_ros.node.parameters.usage import usage
+
+    try:
+        usage(arguments)
+    except RuntimeError as error:  # what rcl does not accept
+        print(f"stream_depth: {error}", file=sys.stderr)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

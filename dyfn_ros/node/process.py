@@ -15,7 +15,6 @@ from dyfn_core.models import load_model
 from dyfn_ros.node.end_request import EndRequest
 from dyfn_ros.node.executor import NodeExecutor
 from dyfn_ros.node.node import ModelLoader, StreamDepthNode
-from dyfn_ros.node.parameters.declare import usage
 
 
 def run(args: Sequence[str], load: ModelLoader | None, end: EndRequest) -> int:
@@ -25,7 +24,6 @@ def run(args: Sequence[str], load: ModelLoader | None, end: EndRequest) -> int:
     """
     end.open()
     try:
-        usage(args)
         # rclpy's own handlers wake an executor before they end its context: it may miss the end.
         rclpy.init(args=list(args), signal_handler_options=SignalHandlerOptions.NO)
         node = StreamDepthNode(load or load_model, ending=end.asked)

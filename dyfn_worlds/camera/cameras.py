@@ -8,14 +8,13 @@ import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from dyfn_worlds.camera.choices import USUAL
 from dyfn_worlds.render.renderer import RenderCamera
 from dyfn_worlds.scene.scene import Scene
 
 FAR = 200.0
 CLEARANCE = 0.3
 PROBES = 32
-USUAL = "usual"
-PLACEMENTS = (USUAL, "close", "steep", "low", "above")
 LENSES = ((38.0, 62.0), (55.0, 82.0), (80.0, 118.0))  # degrees across
 
 

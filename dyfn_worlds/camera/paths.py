@@ -7,17 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dyfn_worlds.camera.cameras import CLEARANCE, CameraLens, FreeSpace, pose_at
+from dyfn_worlds.camera.choices import PACES
 from dyfn_worlds.render.renderer import RenderCamera
 
 RATE = 60.0  # samples a second of a path
-# how a camera moves: metres a second, radians of slow turning, share
-PACES = {
-    "standing": ((0.0, 0.12), (0.3, 1.3), 0.2),
-    "walking": ((0.3, 1.2), (0.3, 1.2), 0.55),
-    "hurried": ((0.8, 1.8), (0.8, 2.2), 0.25),
-    "static": ((0.0, 0.0), (0.0, 0.0), 0.0),
-    "turning": ((0.0, 0.05), (0.8, 2.2), 0.0),
-}
 
 
 @dataclass(frozen=True)

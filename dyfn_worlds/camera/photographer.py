@@ -8,7 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from dyfn_worlds.camera.cameras import USUAL, CameraLens, FreeSpace, placed_view
+from dyfn_worlds.camera.cameras import CameraLens, FreeSpace, placed_view
+from dyfn_worlds.camera.choices import SAMPLES, SUBPIXELS, USUAL
 from dyfn_worlds.camera.paths import CameraPath, random_path
 from dyfn_worlds.camera.staging import LightScript, stage, stand
 from dyfn_worlds.render.occlusion import shade_corners
@@ -21,8 +22,6 @@ PROBE_SHRINK = 4
 MAX_SUBFRAMES = 8
 PIXELS_A_SUBFRAME = 1.6
 GAINS = (0.05, 40.0)
-SUBPIXELS = ((-0.33, 0.15), (0.15, 0.33), (0.33, -0.33))
-SAMPLES = len(SUBPIXELS) + 1
 
 
 @dataclass(frozen=True)

@@ -61,15 +61,15 @@ def test_extras_name_extras_that_exist(project: dict[str, Any]) -> None:
 
 def test_the_demo_recording_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """setup.py ships it, and an installation finds it from anywhere."""
-    from dyfn_ros.demo import cli
+    from dyfn_ros.demo import options
 
     assert '"bags/demo"' in (ROOT / "setup.py").read_text(encoding="utf-8")
     share = tmp_path / "share/dyfn_ros/bags/demo"
     share.mkdir(parents=True)
-    elsewhere = tmp_path / "lib/python3.12/site-packages/dyfn_ros/demo/cli.py"
-    monkeypatch.setattr(cli, "__file__", str(elsewhere))
+    elsewhere = tmp_path / "lib/python3.12/site-packages/dyfn_ros/demo/options.py"
+    monkeypatch.setattr(options, "__file__", str(elsewhere))
     monkeypatch.chdir(tmp_path / "share")
-    assert cli.default_recording() == share
+    assert options.default_recording() == share
 
 
 def test_pixi_has_the_packages_version_floor(project: dict[str, Any]) -> None:

@@ -38,19 +38,22 @@ def without(modules: Sequence[str], place: str, *words: str) -> subprocess.Compl
 
 
 @pytest.mark.parametrize(
-    ("place", "hidden", "extra"),
+    ("line", "hidden", "extra"),
     [
         ("dyfn_ros.commands:stream_depth", MODULES["ros"], "ros"),
-        ("dyfn_worlds.commands:main", WORLDS, "worlds"),
+        ("dyfn_worlds.commands:main --assets . --out o", WORLDS, "worlds"),
         pytest.param(
-            "dyfn_core.cli.commands:train", MODULES["train"], "train", marks=pytest.mark.slow
+            "dyfn_core.cli.commands:train dyfn --data . --out o",
+            MODULES["train"],
+            "train",
+            marks=pytest.mark.slow,
         ),
     ],
 )
 def test_a_command_that_cannot_do_without_its_extra_names_it(
-    place: str, hidden: Sequence[str], extra: str
+    line: str, hidden: Sequence[str], extra: str
 ) -> None:
-    done = without(hidden, place, "--help")
+    done = without(hidden, *line.split())
     assert done.returncode in (1, 2), done.stderr
     assert done.stderr.count("\n") == 1 and f"pip install 'dyfn_ros[{extra}]'" in done.stderr
     assert done.stdout == ""

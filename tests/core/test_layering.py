@@ -53,7 +53,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
 ABOVE = {
     "dyfn_core": {"cli"},
     "dyfn_ros": {"demo", "commands"},
-    "dyfn_worlds": {"cli", "commands", "generate", "casting"},
+    "dyfn_worlds": {"cli", "commands", "generate", "casting", "render_shards"},
 }
 # Packages from outside -> where they may be imported: "package" or "package.room".
 RCLPY, BAGS = ("rclpy",), ("rosbags", "mcap", "apsw")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dyfn_worlds.camera.cameras import PLACEMENTS, CameraLens, FreeSpace, placed_view
+from dyfn_worlds.camera.cameras import CameraLens, FreeSpace, placed_view
+from dyfn_worlds.camera.choices import PLACEMENTS
 from dyfn_worlds.camera.paths import random_path
 from dyfn_worlds.rooms.rooms import furnished_room
 from dyfn_worlds.scene.scene import Scene

@@ -23,6 +23,7 @@ from dyfn_core.evaluation.benchmarks.run import (
     variant_scorers,
     versions,
 )
+from dyfn_core.evaluation.choices import LENGTHS
 from dyfn_core.evaluation.report.curves import Curves
 from dyfn_core.evaluation.report.html import Cell, Part, Section, Table, Text, write_report
 from dyfn_core.evaluation.report.pictures import encode_picture
@@ -31,7 +32,6 @@ from dyfn_core.evaluation.report.variants import Variant, headline, key_figures
 from dyfn_core.scoring.plausibility import Plausibility
 from dyfn_core.scoring.protocols import SequenceScorer, drift
 
-LENGTHS = (100, 200, 300, 400, 500)
 Point = dict[str, Any]
 
 

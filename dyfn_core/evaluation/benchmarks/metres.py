@@ -8,10 +8,10 @@ import numpy as np
 
 from dyfn_core.data.frames import DataError
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame
+from dyfn_core.evaluation.choices import POINTS, POSES
 from dyfn_core.metric.motion import MotionPoints
 from dyfn_core.metric.motion_scale import MotionFrame, MotionScaleOptions, MotionScaleState, step
 
-POINTS, POSES = METRES = ("points", "poses")
 RATE = 10.0  # frames a second of benchmarks without stamps
 SIGMA = 0.1  # of the log depth of points that come with the frames, whose errors are not told
 

@@ -30,6 +30,7 @@ from dyfn_core.evaluation.benchmarks.sets.base import (
     BenchmarkSource,
     select,
 )
+from dyfn_core.evaluation.choices import AUTO, DEPTHCRAFTER, LAYOUTS, ORIGINAL
 
 __all__ = [
     "BENCHMARKS",
@@ -43,7 +44,6 @@ __all__ = [
     "open_benchmark",
 ]
 
-AUTO, ORIGINAL, DEPTHCRAFTER = LAYOUTS = ("auto", "original", "depthcrafter")
 _SINTEL = partial(Benchmark, expected=sintel.EXPECTED, settings=sintel.SETTINGS)
 BENCHMARKS = {
     known.name: known

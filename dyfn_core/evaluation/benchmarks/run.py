@@ -16,10 +16,10 @@ from dyfn_core.evaluation.benchmarks.pictures import BenchmarkPictures, Sequence
 from dyfn_core.evaluation.benchmarks.predictions import Method, Predict
 from dyfn_core.evaluation.benchmarks.registry import BenchmarkFrame, BenchmarkSequence, Opened
 from dyfn_core.evaluation.temporal import TRUTH, TemporalScorer
+from dyfn_core.scoring.fits import L1
 from dyfn_core.scoring.plausibility import Plausibility
 from dyfn_core.scoring.protocols import (
     CONTROLS,
-    L1,
     SequenceScore,
     SequenceScorer,
     drift,

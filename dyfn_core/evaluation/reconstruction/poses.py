@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dyfn_core.evaluation.choices import OFFSETS
 from dyfn_core.evaluation.reconstruction.matching import MatchWindow, partners, sample_at
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.geometry.registration import (
@@ -18,7 +19,6 @@ from dyfn_core.geometry.registration import (
 )
 from dyfn_core.geometry.voxel_grid import VoxelGrid
 
-OFFSETS = (1, 5, 21)  # the paper's partners of frame j: j-1, j-5, j-21
 EDGE_SHARE = 0.1  # a step in depth that pixels hang in; they are neither matched nor fused
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 from collections.abc import Callable, Mapping, Sequence
-from textwrap import wrap
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -17,9 +15,7 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.utilities import remove_ros_args
 
-from dyfn_core.cli.arguments import command_parser
 from dyfn_ros.node.parameters.table import (
     CONFIGURE,
     LIMITS,
@@ -27,34 +23,9 @@ from dyfn_ros.node.parameters.table import (
     START,
     NodeSettings,
     Spec,
-    groups,
-    show,
 )
 
 _CAMERA_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-
-
-def usage(arguments: Sequence[str]) -> None:
-    """Take what is not for ROS from the command line: --help, or an error that ends the program.
-
-    arguments: with the program's name first.
-    """
-    lines = []
-    for group, specs in groups().items():
-        lines.append(f"\n{group}:")
-        for name, spec in specs.items():
-            lines.append(f"  {name} [{show(spec.default)}]")
-            lines += wrap(spec.description, 90, initial_indent=" " * 6, subsequent_indent=" " * 6)
-    parser = command_parser(
-        "stream_depth",
-        "Images in, depth and clouds out. Parameters and [defaults]:",
-        "\n".join(lines),
-    )
-    parser.usage = (
-        "stream_depth [--ros-args -r image:=TOPIC -r camera_info:=TOPIC -p NAME:=VALUE ...]"
-    )
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.parse_args(remove_ros_args(list(arguments))[1:])
 
 
 def _descriptor(spec: Spec) -> ParameterDescriptor:

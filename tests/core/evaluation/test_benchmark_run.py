@@ -32,7 +32,8 @@ from dyfn_core.evaluation.report.tables import csv_table, latex_table, markdown_
 from dyfn_core.evaluation.report.worst_frames import WIDTH
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.controls import ema_control, frozen_control, stabilized_by
-from dyfn_core.scoring.protocols import LEAST_SQUARES, SequenceScorer, least_squares
+from dyfn_core.scoring.fits import LEAST_SQUARES
+from dyfn_core.scoring.protocols import SequenceScorer, least_squares
 from dyfn_core.stream.depth_stream import DepthStream
 from tests.support.made_benchmarks import (
     PATCH,

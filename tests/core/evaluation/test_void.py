@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 
 from dyfn_core.cli import eval as cli
+from dyfn_core.cli import eval_commands
 from dyfn_core.data.frames import DataError, FrameError
-from dyfn_core.evaluation.benchmarks.metres import METRES, POSES, MetresStream
+from dyfn_core.evaluation.benchmarks.metres import MetresStream
 from dyfn_core.evaluation.benchmarks.model_method import ModelMethod
 from dyfn_core.evaluation.benchmarks.published import published_metres
 from dyfn_core.evaluation.benchmarks.registry import open_benchmark
 from dyfn_core.evaluation.benchmarks.sets.base import BenchmarkFrame
+from dyfn_core.evaluation.choices import METRES, POSES
 from tests.support.made_benchmarks import (
     PATCH,
     VOID_CAMERA,
@@ -124,7 +126,7 @@ def test_metres_by_given_points_stand_beside_the_published_ones(
     folder = make_void(tmp_path / "release", 150, 6, scored=[1, 4])
     for index in range(6):
         write_slope(folder, index)
-    monkeypatch.setattr(cli, "load_model", lambda name, device: PinholeModel().eval())
+    monkeypatch.setattr(eval_commands, "load_model", lambda name, device: PinholeModel().eval())
     arguments = ["run", "--benchmark", "void-150", "--data", str(tmp_path / "release")]
     arguments += ["--model", "pinhole", "--metres-from", "points", "--no-controls"]
     arguments += ["--no-temporal", "--out", str(tmp_path / "out")]

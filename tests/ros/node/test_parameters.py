@@ -12,8 +12,9 @@ import yaml
 from dyfn_core.stream.options import StreamOptions, options_of
 from dyfn_ros.messages.reference_options import ReferenceOptions
 from dyfn_ros.node.parameters import docs as parameter_docs
-from dyfn_ros.node.parameters.declare import check, check_cameras, usage
+from dyfn_ros.node.parameters.declare import check, check_cameras
 from dyfn_ros.node.parameters.table import CONFIGURE, RUN, SPECS, START, NodeSettings
+from dyfn_ros.node.parameters.usage import usage
 
 ROOT = Path(__file__).parents[3]
 

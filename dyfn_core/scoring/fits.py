@@ -1,0 +1,3 @@
+"""The alignments of a prediction with truth, by name."""
+
+L1, LEAST_SQUARES = FITS = ("l1", "lstsq")
