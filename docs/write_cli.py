@@ -12,6 +12,7 @@ from pathlib import Path
 from textwrap import fill
 
 from dyfn_core.cli import eval as dyfn_eval
+from dyfn_core.cli import export as dyfn_export
 from dyfn_core.cli import train as dyfn_train
 from dyfn_ros.app import options as dyfn_app
 from dyfn_ros.demo import options as dyfn_demo
@@ -42,6 +43,7 @@ def parsers() -> list[argparse.ArgumentParser]:
         dyfn_record.parser(),
         dyfn_demo.parser(),
         dyfn_eval.parser(),
+        dyfn_export.parser(),
         dyfn_train.parser(),
         dyfn_worlds.parser(),
     ]

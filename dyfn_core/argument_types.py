@@ -48,6 +48,14 @@ def finite(text: str) -> float:
     return _parsed(text, float, math.isfinite, "a finite number")
 
 
+def image_size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT -> (H, W)."""
+    found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if found is None:
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 1280x720, got {text!r}")
+    return int(found[2]), int(found[1])
+
+
 def device_name(text: str) -> str:
     """A name that models.resolve_device may know; whether it is here shows when it is used."""
     if not re.fullmatch(r"auto|cpu|(cuda|mps|xpu)(:\d+)?", text):

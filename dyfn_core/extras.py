@@ -12,6 +12,7 @@ MODULES = {
     "video": ("av",),
     "rerun": ("rerun",),
     "app": ("gradio",),
+    "onnx": ("onnx", "onnxruntime"),
     "foxglove": ("mcap_protobuf",),
     "ray": ("ray",),
 }

@@ -85,7 +85,7 @@ class StreamState:
         shapes = {tuple(state.hidden.shape[1:]) for state in known}
         if len(shapes) > 1:
             raise ValueError(f"states of different shapes make no batch: {sorted(shapes)}")
-        fresh = known[0]._without_history()
+        fresh = known[0].without_history()
         rows = [fresh if state is None else state for state in states]
         return StreamState(
             torch.cat([row.hidden for row in rows]),
@@ -123,7 +123,13 @@ class StreamState:
             None if self.ema_std is None else self.ema_std.to(device),
         )
 
-    def _without_history(self) -> StreamState:
+    def without_history(self) -> StreamState:
+        """What None means: the state of one stream before its first frame, of these shapes.
+
+        Returns:
+            A zero hidden state and NaN for the averages.
+        """
+
         def blank(like: Tensor | None) -> Tensor | None:
             return None if like is None else torch.full_like(like[:1], float("nan"))
 

@@ -13,6 +13,7 @@ import pytest
 
 from dyfn_core import __version__
 from dyfn_core.cli import eval as dyfn_eval
+from dyfn_core.cli import export as dyfn_export
 from dyfn_core.cli import train as dyfn_train
 from dyfn_core.cli.arguments import command_parser, renamed
 from dyfn_ros.app import cli as dyfn_app
@@ -38,6 +39,7 @@ MAINS: dict[str, Main] = {
     "dyfn-record": dyfn_record.main,
     "dyfn-demo": dyfn_demo.main,
     "dyfn-eval": dyfn_eval.main,
+    "dyfn-export": dyfn_export.main,
     "dyfn-train": dyfn_train.main,
     "dyfn-worlds": dyfn_worlds.main,
 }
@@ -48,6 +50,7 @@ PARSERS: dict[str, Callable[[], argparse.ArgumentParser]] = {
     "dyfn-record": record_options.parser,
     "dyfn-demo": demo_options.parser,
     "dyfn-eval": dyfn_eval.parser,
+    "dyfn-export": dyfn_export.parser,
     "dyfn-train": dyfn_train.parser,
     "dyfn-worlds": dyfn_worlds.parser,
 }
@@ -84,6 +87,9 @@ NONSENSE = [
     ("dyfn-eval reconstruct . --out o --offsets 0", "--offsets"),
     ("dyfn-eval study . --out o --factors 0", "--factors: expected a finite number above 0"),
     ("dyfn-eval", "COMMAND"),
+    ("dyfn-export dyfn-mini --out o --size 640", "--size: expected WIDTHxHEIGHT"),
+    ("dyfn-export no_such_model --out o", "no model 'no_such_model'"),
+    ("dyfn-export dyfn-mini", "--out"),
     ("dyfn-train base --out o --max-steps 0", "--max-steps"),
     ("dyfn-train evaluate m --stride x", "--stride"),
     ("dyfn-train experiments --seeds 0", "--seeds"),

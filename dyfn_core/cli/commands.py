@@ -8,6 +8,11 @@ def train() -> int:
     return start("dyfn-train", "dyfn_core.cli.train")
 
 
+def export() -> int:
+    """`dyfn-export`."""
+    return start("dyfn-export", "dyfn_core.cli.export")
+
+
 def evaluate() -> int:
     """`dyfn-eval`."""
     return start("dyfn-eval", "dyfn_core.cli.eval")

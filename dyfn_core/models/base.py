@@ -26,6 +26,20 @@ FARTHEST = 1000.0  # times the unit; disparities closer to 0 say nothing but "fa
 
 
 @dataclass(frozen=True)
+class Prepared:
+    """An image as the encoder sees it.
+
+    pixels: B x 3 x h x w, resized and normalised.
+    image_size: (H, W) of the caller's image.
+    network_size: (H, W) of the resized image that the decoder works at.
+    """
+
+    pixels: Tensor
+    image_size: tuple[int, int]
+    network_size: tuple[int, int]
+
+
+@dataclass(frozen=True)
 class Latent:
     """The feature map F_t and what the decoder must know about the image it came from.
 
@@ -131,6 +145,11 @@ class AffineDisparity:
 Affine = AffinePoints | AffineDepth | AffineDisparity
 
 
+def plane(x: Tensor) -> tuple[int, int]:
+    """(h, w) of a map ... x h x w, as plain numbers also while it is traced for an export."""
+    return int(x.shape[-2]), int(x.shape[-1])
+
+
 def own_entries(config: Mapping[str, Any]) -> dict[str, Any]:
     """A checkpoint's config without what is not of the model's class: its type and its DyFN."""
     return {key: value for key, value in config.items() if key not in ("type", "stabilizer")}
@@ -148,6 +167,7 @@ class GeometryModel(nn.Module, ABC):
     knows_metres: "" for no; "camera" when it needs the focal lengths for them; else "always".
     stabilizer_pool: the pooling that suits a new stabilizer on this latent.
     token_cell: pixels along the side of one token of num_tokens.
+    preparation: what `prepare` does, in words for whoever does it elsewhere.
     """
 
     mask_threshold: float = 0.5
@@ -156,6 +176,7 @@ class GeometryModel(nn.Module, ABC):
     token_cell: int = 14
     has_normals: bool = False
     knows_metres: str = ""
+    preparation: str = "none"
     # No class-level None here: it would hide the registered submodule.
     stabilizer: DyFN | None
 
@@ -182,9 +203,24 @@ class GeometryModel(nn.Module, ABC):
     def latent_channels(self) -> int:
         """C of the latent."""
 
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """image: B x 3 x H x W float RGB in 0..1 -> what the encoder sees; here the image itself.
+
+        num_tokens: see encode.
+        """
+        size = plane(image)
+        return Prepared(image, size, size)
+
     @abstractmethod
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """The encoder alone -> Latent."""
+
     def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image: B x 3 x H x W float RGB in 0..1 -> Latent."""
+        """image: B x 3 x H x W float RGB in 0..1 -> Latent.
+
+        num_tokens: how finely to look; None for the model's default.
+        """
+        return self.encode_prepared(self.prepare(image, num_tokens))
 
     @abstractmethod
     def decode(self, latent: Latent) -> Affine:

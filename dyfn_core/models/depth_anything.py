@@ -13,7 +13,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dyfn_core.models.base import AffineDisparity, GeometryModel, Latent, own_entries
+from dyfn_core.models.base import (
+    AffineDisparity,
+    GeometryModel,
+    Latent,
+    Prepared,
+    own_entries,
+    plane,
+)
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.models.dpt import DPTHead, resized
 
@@ -61,6 +68,9 @@ class DepthAnythingModel(GeometryModel):
 
     quantity = "disparity"
     stabilizer_pool = 4  # the latent is four times as fine as the tokens
+    preparation = (
+        "resize by bicubic interpolation; less the mean (.485, .456, .406), over (.229, .224, .225)"
+    )
 
     image_mean: Tensor
     image_std: Tensor
@@ -105,14 +115,18 @@ class DepthAnythingModel(GeometryModel):
             return _at_least(factor * height, least), _at_least(factor * width, least)
         return budget_size(image_size, num_tokens)
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image B x 3 x H x W in 0..1 -> the last fused map, four cells a token along each side."""
-        image_size = (image.shape[-2], image.shape[-1])
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """See GeometryModel: resized to network_size."""
+        image_size = plane(image)
         size = self.network_size(image_size, num_tokens)
         if size != image_size:
             image = F.interpolate(image, size, mode="bicubic", align_corners=False)
-        layers = self.pretrained((image - self.image_mean) / self.image_std, self.variant.blocks)
-        return Latent(self.depth_head.fuse(layers), image_size, size)
+        return Prepared((image - self.image_mean) / self.image_std, image_size, size)
+
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """See GeometryModel: the last fused map, four cells a token along each side."""
+        layers = self.pretrained(prepared.pixels, self.variant.blocks)
+        return Latent(self.depth_head.fuse(layers), prepared.image_size, prepared.network_size)
 
     def decode(self, latent: Latent) -> AffineDisparity:
         """Latent -> disparity at the image's size."""

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dyfn_core.models.base import AffineDepth, GeometryModel, Latent
+from dyfn_core.models.base import AffineDepth, GeometryModel, Latent, Prepared, plane
 from dyfn_core.models.depth_anything import (
     VARIANTS,
     Variant,
@@ -81,6 +81,10 @@ class DepthAnything3Model(GeometryModel):
     """
 
     mask_threshold = 0.0  # of SKY less the sky output
+    preparation = (
+        "resize in 8 bits, by areas where it shrinks and bicubic where it grows; less the mean "
+        "(.485, .456, .406), over (.229, .224, .225)"
+    )
     stabilizer_pool = 4  # the latent is four times as fine as the tokens
 
     image_mean: Tensor
@@ -128,22 +132,22 @@ class DepthAnything3Model(GeometryModel):
         first = (max(1, round(height * factor)), max(1, round(width * factor)))
         return [first, (_nearest_patches(first[0]), _nearest_patches(first[1]))]
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image B x 3 x H x W in 0..1 -> the last fused map, four cells a token along each side.
-
-        The image is resized as officially, in 8 bits.
-        """
-        image_size = (image.shape[-2], image.shape[-1])
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """See GeometryModel: resized as officially, in 8 bits."""
+        image_size = plane(image)
         sizes = self.network_sizes(image_size, num_tokens)
-        prepared = torch.from_numpy(np.stack([_resized(one, sizes) for one in _bytes(image)]))
-        return self.encode_prepared(prepared.to(image.device), image_size)
+        resized = torch.from_numpy(np.stack([_resized(one, sizes) for one in _bytes(image)]))
+        return self.normalised(resized.to(image.device), image_size)
 
-    def encode_prepared(self, image: Tensor, image_size: tuple[int, int]) -> Latent:
-        """As encode, from the resized image, B x H x W x 3 uint8."""
+    def normalised(self, image: Tensor, image_size: tuple[int, int]) -> Prepared:
+        """The resized image, B x h x w x 3 uint8 -> what the encoder sees."""
         x = image.permute(0, 3, 1, 2).float() / 255
-        x = (x - self.image_mean) / self.image_std
-        layers = self.model.backbone.pretrained(x, self.variant.blocks)
-        return Latent(self.model.head.fuse(layers), image_size, (x.shape[-2], x.shape[-1]))
+        return Prepared((x - self.image_mean) / self.image_std, image_size, plane(x))
+
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """See GeometryModel: the last fused map, four cells a token along each side."""
+        layers = self.model.backbone.pretrained(prepared.pixels, self.variant.blocks)
+        return Latent(self.model.head.fuse(layers), prepared.image_size, prepared.network_size)
 
     def decode(self, latent: Latent) -> AffineDepth:
         """Latent -> depth and where there is no sky, at the image's size."""

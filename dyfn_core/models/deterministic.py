@@ -4,7 +4,8 @@ On the CPU torch picks another library for a convolution when it has one thread,
 and MKL splits the sums of small matrix products among its threads: the order of the sums changes.
 Here every product is a convolution of oneDNN, whose threads share out the outputs and never one
 sum; norms run on planes, and few channels are resized plane by plane. The values differ from those
-of torch.nn in the last bits only. On other devices and dtypes these are torch's own.
+of torch.nn in the last bits only. On other devices and dtypes, and in what is exported or compiled,
+these are torch's own.
 """
 
 from __future__ import annotations
@@ -95,7 +96,14 @@ def resize(x: Tensor, size: tuple[int, ...], align_corners: bool = False) -> Ten
     return x.reshape(batch, channels, *size)
 
 
+def is_traced() -> bool:
+    """Whether this thread records what it computes, for an export."""
+    return bool(torch.jit.is_tracing())  # type: ignore[attr-defined, no-untyped-call]
+
+
 def _is_onednn(x: Tensor, weight: Tensor) -> bool:
+    if is_traced() or torch.compiler.is_compiling():  # neither knows oneDNN's own call
+        return False
     return (
         x.device.type == "cpu"
         and x.dtype == weight.dtype == torch.float32

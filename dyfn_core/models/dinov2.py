@@ -132,7 +132,7 @@ class DinoV2(nn.Module):
         self, image: Tensor, layers: int | Sequence[int]
     ) -> tuple[list[Tensor], Tensor]:
         """As forward, and the class token of the last of these blocks after the norm, B x C."""
-        grid = (image.shape[-2] // PATCH, image.shape[-1] // PATCH)
+        grid = (int(image.shape[-2]) // PATCH, int(image.shape[-1]) // PATCH)
         tokens = self.patch_embed(image)
         x = torch.cat([self.cls_token.expand(len(tokens), -1, -1), tokens], dim=1)
         x = x + self._position_embedding(grid)

@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear
+from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear, is_traced
 from dyfn_core.prediction import StreamState
 
 EPSILON = 1e-5
@@ -210,9 +210,14 @@ class ConvGRUDyFN(DyFN):
         pool = self.config.pool
         if pool == 1:
             return features
-        height, width = features.shape[-2:]
+        height, width = int(features.shape[-2]), int(features.shape[-1])
         size = (math.ceil(height / pool), math.ceil(width / pool))
-        return F.adaptive_avg_pool2d(features, size)
+        if not is_traced():
+            return F.adaptive_avg_pool2d(features, size)
+        if height % size[0] == 0 and width % size[1] == 0:
+            return F.avg_pool2d(features, (height // size[0], width // size[1]))
+        rows, columns = _windows(height, size[0]), _windows(width, size[1])
+        return rows.to(features) @ features @ columns.to(features).mT
 
 
 class GRUDyFN(DyFN):
@@ -246,6 +251,15 @@ class GRUDyFN(DyFN):
         ema_std = _moving_average(None if state is None else state.ema_std, std.detach())
         gamma = (ema_std + gamma).clamp(min=EPSILON)
         return gamma, ema_mean + beta, StreamState(hidden, ema_mean, ema_std)
+
+
+def _windows(length: int, count: int) -> Tensor:
+    """The averages that adaptive pooling takes along one side, as a matrix count x length."""
+    matrix = torch.zeros(count, length)
+    for index in range(count):
+        first, last = index * length // count, -(-(index + 1) * length // count)
+        matrix[index, first:last] = 1 / (last - first)
+    return matrix
 
 
 def _moving_average(previous: Tensor | None, now: Tensor) -> Tensor:

@@ -15,7 +15,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
+from dyfn_core.models.base import (
+    AffinePoints,
+    GeometryModel,
+    Latent,
+    Prepared,
+    own_entries,
+    plane,
+)
 from dyfn_core.models.deterministic import (
     DeterministicConv2d,
     DeterministicGroupNorm,
@@ -194,6 +201,9 @@ class MiniModel(GeometryModel):
 
     mask_threshold = 0.5
     token_cell = CELL
+    preparation = (
+        "resize by bilinear interpolation with antialiasing; (x - 127 / 255) / (128 / 255)"
+    )
 
     def __init__(self, config: MiniConfig | None = None) -> None:
         super().__init__()
@@ -246,20 +256,26 @@ class MiniModel(GeometryModel):
             max(1, round(width * factor / MULTIPLE)) * MULTIPLE,
         )
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image: B x 3 x H x W float RGB in 0..1 -> Latent (features B x C x h/8 x w/8)."""
-        image_size = (image.shape[-2], image.shape[-1])
-        size = self.network_size(image_size, num_tokens)
-        return self.encode_at(image, size)
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """See GeometryModel: resized to network_size."""
+        return self.prepare_at(image, self.network_size(plane(image), num_tokens))
+
+    def prepare_at(self, image: Tensor, size: tuple[int, int]) -> Prepared:
+        """As prepare, at a network size that the caller chose (multiples of 32)."""
+        image_size = plane(image)
+        if image_size != size:
+            image = F.interpolate(image, size, mode="bilinear", antialias=True)
+        return Prepared((image - IMAGE_MEAN) / IMAGE_STD, image_size, size)
+
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """See GeometryModel; the features are B x C x h/8 x w/8."""
+        pixels = prepared.pixels.contiguous(memory_format=torch.channels_last)
+        features = self.neck(self.encoder(pixels))
+        return Latent(features, prepared.image_size, prepared.network_size)
 
     def encode_at(self, image: Tensor, size: tuple[int, int]) -> Latent:
         """As encode, at a network size that the caller chose (multiples of 32)."""
-        image_size = (image.shape[-2], image.shape[-1])
-        if image_size != size:
-            image = F.interpolate(image, size, mode="bilinear", antialias=True)
-        image = (image - IMAGE_MEAN) / IMAGE_STD
-        features = self.neck(self.encoder(image.contiguous(memory_format=torch.channels_last)))
-        return Latent(features, image_size, size)
+        return self.encode_prepared(self.prepare_at(image, size))
 
     def decode_raw(self, latent: Latent) -> tuple[Tensor, Tensor]:
         """Raw points B x 3 x h x w and mask B x h x w at the decoder's own resolution."""
@@ -286,15 +302,15 @@ def remap_exp(raw: Tensor) -> Tensor:
 
 def _view_plane(like: Tensor, aspect: float) -> Tensor:
     """B x 2 x h x w: position on the view plane, whose diagonal spans -1 to 1."""
-    batch, _, height, width = like.shape
+    batch, (height, width) = like.shape[0], plane(like)
     span_x = aspect / math.hypot(aspect, 1)
     span_y = 1 / math.hypot(aspect, 1)
     u = torch.linspace(-1 + 1 / width, 1 - 1 / width, width, dtype=like.dtype, device=like.device)
     v = torch.linspace(
         -1 + 1 / height, 1 - 1 / height, height, dtype=like.dtype, device=like.device
     )
-    plane = torch.stack(torch.meshgrid(u * span_x, v * span_y, indexing="xy"))
-    return plane.expand(batch, -1, -1, -1)
+    grid = torch.stack(torch.meshgrid(u * span_x, v * span_y, indexing="xy"))
+    return grid.expand(batch, -1, -1, -1)
 
 
 def _with_view_plane(x: Tensor, aspect: float) -> Tensor:

@@ -12,7 +12,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
+from dyfn_core.models.base import (
+    AffinePoints,
+    GeometryModel,
+    Latent,
+    Prepared,
+    own_entries,
+    plane,
+)
 from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicGroupNorm, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.prediction import StreamState
@@ -123,7 +130,7 @@ class Head(nn.Module):
 
 
 def _with_uv(x: Tensor, aspect: float) -> Tensor:
-    uv = uv_grid((x.shape[-2], x.shape[-1]), aspect, x.dtype, x.device)
+    uv = uv_grid(plane(x), aspect, x.dtype, x.device)
     return torch.cat([x, uv.expand(len(x), -1, -1, -1)], dim=1)
 
 
@@ -171,6 +178,12 @@ def remap_points(raw: Tensor, remap: str) -> Tensor:
 class MoGeModel(GeometryModel):
     """MoGe v1, with or without DyFN on its latent (paper sections 2 and 3)."""
 
+    preparation = (
+        "resize to the network's size by bicubic interpolation with antialiasing; less the mean "
+        "(.485, .456, .406), over (.229, .224, .225); resize to whole patches by bilinear "
+        "interpolation with antialiasing"
+    )
+
     image_mean: Tensor
     image_std: Tensor
 
@@ -199,10 +212,10 @@ class MoGeModel(GeometryModel):
         """Channels of the summed projections."""
         return self.architecture.dim_proj
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image B x 3 x H x W in 0..1 -> the summed projections of the last encoder layers."""
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """See GeometryModel: resized to the token budget, normalised, resized to whole patches."""
         tokens = self.architecture.num_tokens_range[1] if num_tokens is None else num_tokens
-        size = (image.shape[-2], image.shape[-1])
+        size = plane(image)
         network_size = resized(size, tokens)
         image = F.interpolate(
             image, network_size, mode="bicubic", align_corners=False, antialias=True
@@ -211,8 +224,12 @@ class MoGeModel(GeometryModel):
         image = F.interpolate(
             image, whole_patches(network_size), mode="bilinear", align_corners=False, antialias=True
         )
-        layers = self.backbone(image, self.architecture.intermediate_layers)
-        return Latent(self.head.fuse(layers), size, network_size)
+        return Prepared(image, size, network_size)
+
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """See GeometryModel: the summed projections of the last encoder layers."""
+        layers = self.backbone(prepared.pixels, self.architecture.intermediate_layers)
+        return Latent(self.head.fuse(layers), prepared.image_size, prepared.network_size)
 
     def stabilize_latent(
         self, latent: Latent, state: StreamState | None

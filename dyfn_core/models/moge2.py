@@ -13,7 +13,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from dyfn_core.geometry.camera import uv_grid
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, own_entries
+from dyfn_core.models.base import (
+    AffinePoints,
+    GeometryModel,
+    Latent,
+    Prepared,
+    own_entries,
+    plane,
+)
 from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicLinear, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
 from dyfn_core.models.moge import REMAPS, remap_points
@@ -186,9 +193,12 @@ class Encoder(nn.Module):
         self.register_buffer("image_mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1))
         self.register_buffer("image_std", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
 
+    def normalised(self, image: Tensor) -> Tensor:
+        """image B x 3 x h x w in 0..1 -> less the mean, over the deviation."""
+        return (image - self.image_mean) / self.image_std
+
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """image B x 3 x 14h x 14w in 0..1 -> latent B x D x h x w, class token B x C."""
-        image = (image - self.image_mean) / self.image_std
+        """image B x 3 x 14h x 14w, normalised -> latent B x D x h x w, class token B x C."""
         maps, summary = self.backbone.with_class_token(image, self.layers)
         projected: list[Tensor] = [
             project(one) for project, one in zip(self.output_projections, maps, strict=True)
@@ -300,6 +310,10 @@ class MoGe2Model(GeometryModel):
     """
 
     mask_threshold = 0.0  # of the raw mask: half of its sigmoid
+    preparation = (
+        "resize by bilinear interpolation with antialiasing; less the mean (.485, .456, .406), "
+        "over (.229, .224, .225)"
+    )
     normal_head: ConvStack | None
     mask_head: ConvStack | None
     scale_head: ScaleHead | None
@@ -331,17 +345,21 @@ class MoGe2Model(GeometryModel):
         """Channels of the summed projections."""
         return self.architecture.encoder.dim_out
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        """image B x 3 x H x W in 0..1 -> the summed projections of the chosen blocks."""
-        size = (image.shape[-2], image.shape[-1])
+    def prepare(self, image: Tensor, num_tokens: int | None = None) -> Prepared:
+        """See GeometryModel: resized to the token budget."""
+        size = plane(image)
         tokens = self.architecture.num_tokens_range[1] if num_tokens is None else num_tokens
         rows, columns = token_grid(size, tokens)
         network_size = (PATCH * rows, PATCH * columns)
         image = F.interpolate(
             image, network_size, mode="bilinear", align_corners=False, antialias=True
         )
-        features, summary = self.encoder(image)
-        return Latent(features, size, network_size, summary)
+        return Prepared(self.encoder.normalised(image), size, network_size)
+
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        """See GeometryModel: the summed projections of the chosen blocks."""
+        features, summary = self.encoder(prepared.pixels)
+        return Latent(features, prepared.image_size, prepared.network_size, summary)
 
     def decode(self, latent: Latent) -> AffinePoints:
         """Latent -> points, mask and metric scale at the image's size; no normals."""
@@ -371,7 +389,7 @@ class MoGe2Model(GeometryModel):
         """The neck's five maps."""
         height, width = latent.image_size
         features = latent.features
-        rows, columns = features.shape[-2:]
+        rows, columns = plane(features)
         sizes = [(rows << level, columns << level) for level in range(LEVELS)]
         places = [
             uv_grid(size, width / height, features.dtype, features.device).expand(

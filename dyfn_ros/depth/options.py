@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from dyfn_core.argument_types import above_zero, at_least_one, finite_above_zero
+from dyfn_core.argument_types import above_zero, at_least_one, finite_above_zero, image_size
 from dyfn_core.cli.arguments import (
     Options,
     add_device,
@@ -122,7 +121,7 @@ def _add_reading(group: Options) -> None:
     )
     group.add_argument(
         "--capture-size",
-        type=_size,
+        type=image_size,
         metavar="WIDTHxHEIGHT",
         help="ask a webcam for this size (default: its own)",
     )
@@ -201,13 +200,6 @@ def _add_writing(group: Options) -> None:
         f"(default: {PNG_VALUES:g}: millimetres where depth is in metres)",
     )
     add("--overwrite", action="store_true", help="replace results that are there")
-
-
-def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
-    if found is None:
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT such as 1280x720, got {text!r}")
-    return int(found[2]), int(found[1])
 
 
 def _degrees(text: str) -> float:

@@ -42,7 +42,7 @@ def test_package_data_are_there(project: dict[str, Any]) -> None:
 
 def test_every_command_has_its_function(project: dict[str, Any]) -> None:
     scripts = project["project"]["scripts"]
-    assert len(scripts) == 9
+    assert len(scripts) == 10
     for command, place in scripts.items():
         module, function = place.split(":")
         spec = find_spec(module)

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from dyfn_core.geometry.camera import depth_to_points, focal_from_fov, intrinsics_from_focal
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, Prepared
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from tests.support.seeded import redraw
 
@@ -43,9 +42,9 @@ class PinholeModel(GeometryModel):
     def latent_channels(self) -> int:
         return 3
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
-        size = (image.shape[-2], image.shape[-1])
-        return Latent(image * self.unit, size, size)
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        features = prepared.pixels * self.unit
+        return Latent(features, prepared.image_size, prepared.network_size)
 
     def decode(self, latent: Latent) -> AffinePoints:
         height, width = latent.image_size

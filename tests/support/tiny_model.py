@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn import functional
 
-from dyfn_core.models.base import AffinePoints, GeometryModel, Latent
+from dyfn_core.models.base import AffinePoints, GeometryModel, Latent, Prepared
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 
 FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
@@ -43,14 +43,14 @@ class TinyModel(GeometryModel):
     def latent_channels(self) -> int:
         return CHANNELS
 
-    def encode(self, image: Tensor, num_tokens: int | None = None) -> Latent:
+    def encode_prepared(self, prepared: Prepared) -> Latent:
+        image = prepared.pixels
         first = {tuple(one) for one in (image[:, :, 0, 0] * 255).round().int().tolist()}
         if FAILING in first:
             raise RuntimeError("the picture that must fail")
         if BLOCKING in first:
             wait_for_go()
-        size = (image.shape[-2], image.shape[-1])
-        return Latent(self.encoder(image), size, size)
+        return Latent(self.encoder(image), prepared.image_size, prepared.network_size)
 
     def decode(self, latent: Latent) -> AffinePoints:
         height, width = latent.image_size

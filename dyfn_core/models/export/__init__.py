@@ -1,0 +1,1 @@
+"""Models as ONNX files: the pure step (image, state) -> (points, mask, state)."""

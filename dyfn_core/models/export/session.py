@@ -1,0 +1,76 @@
+"""A graph of named tensors in onnxruntime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import onnxruntime
+import torch
+
+from dyfn_core.models.checkpoints import CheckpointError
+from dyfn_core.models.export.parts import Tensors
+from dyfn_core.models.export.step_file import StepInfo, info_of
+
+CPU = ("CPUExecutionProvider",)
+
+
+class OnnxSession:
+    """An ONNX graph, ready to run on the CPU.
+
+    Attributes:
+        inputs: Names of what goes in.
+        outputs: Names of what comes out.
+        metadata: What the file says of itself.
+    """
+
+    def __init__(self, source: str | Path | bytes, threads: int = 0) -> None:
+        """Load a graph.
+
+        Args:
+            source: A file, or a file's content.
+            threads: CPU threads; 0 takes as many as torch computes with now.
+
+        Raises:
+            CheckpointError: It cannot be read, or has something that onnxruntime does not know.
+        """
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads or torch.get_num_threads()
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3  # errors; warnings are of shapes that were folded
+        graph = source if isinstance(source, bytes) else str(source)
+        try:
+            self._session = onnxruntime.InferenceSession(graph, options, providers=list(CPU))
+        except Exception as error:  # of many kinds, none of them public
+            name = "an ONNX graph" if isinstance(source, bytes) else source
+            raise CheckpointError(f"{name} cannot be loaded by onnxruntime: {error}") from error
+        self.inputs = tuple(value.name for value in self._session.get_inputs())
+        self.outputs = tuple(value.name for value in self._session.get_outputs())
+        self.metadata: dict[str, str] = self._session.get_modelmeta().custom_metadata_map
+
+    def run(self, tensors: Tensors) -> Tensors:
+        """Named inputs (float32, others are left out) -> named outputs, on the CPU."""
+        given = {name: tensors[name].numpy(force=True) for name in self.inputs}
+        found = self._session.run(self.outputs, given)
+        return {
+            name: torch.from_numpy(value) for name, value in zip(self.outputs, found, strict=True)
+        }
+
+
+def load_step(path: str | Path, threads: int = 0) -> tuple[StepInfo, OnnxSession]:
+    """A file of dyfn-export, ready to run.
+
+    Args:
+        path: The file.
+        threads: See OnnxSession.
+
+    Returns:
+        What the file says of itself, and the step: `image` and the state in, see StepInfo.
+
+    Raises:
+        FileNotFoundError: No such file.
+        CheckpointError: Not a file of dyfn-export, or of another format.
+    """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"no such file: {path}")
+    session = OnnxSession(path, threads)
+    return info_of(session.metadata, str(path)), session
