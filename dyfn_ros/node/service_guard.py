@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode
 
 Answer = Callable[[Any, Any], Any]
 
 
-def guard_services(node: Node, warn: Callable[[str], None]) -> None:
+def guard_services(node: LifecycleNode, warn: Callable[[str], None]) -> None:
     """Call when the node has the services of its base classes.
 
     rclpy raises on lifecycle transitions that the present state does not have and on parameters
@@ -21,7 +22,15 @@ def guard_services(node: Node, warn: Callable[[str], None]) -> None:
     request was refused, and why.
     """
     for service in node.services:
-        service.callback = _guarded(service.srv_name, service.callback, warn)
+        answer = partial(_checked, node, service.callback)
+        service.callback = _guarded(service.srv_name, answer, warn)
+
+
+def _checked(node: LifecycleNode, answer: Answer, request: Any, response: Any) -> Any:
+    """The answer; raises where rclpy says no to the label of a transition without a word."""
+    if isinstance(request, ChangeState.Request) and request.transition.label:
+        node._state_machine.get_transition_by_label(request.transition.label)
+    return answer(request, response)
 
 
 def _guarded(name: str, answer: Answer, warn: Callable[[str], None]) -> Answer:

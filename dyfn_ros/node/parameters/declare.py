@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -16,6 +17,7 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from dyfn_ros.messages.encodings import quoted
 from dyfn_ros.node.parameters.table import (
     CONFIGURE,
     LIMITS,
@@ -130,6 +132,8 @@ class NodeParameters:
 
         on_node: sets what is declared, all or nothing; what it raises, this raises.
         """
+        if reason := self._senseless(changes):
+            return SetParametersResult(successful=False, reason=reason)
         new = list(dict.fromkeys(one.name for one in changes if self._is_new(one.name)))
         for full in new:
             camera, _, name = full.partition(".")
@@ -147,6 +151,19 @@ class NodeParameters:
                     del self._own[camera][name]
                     self._node.undeclare_parameter(full)
         return result
+
+    def _senseless(self, changes: Sequence[Parameter]) -> str:
+        """-> which of these is no parameter, or has no value, or "". (rclpy does not name it.)"""
+        for name, kind in ((one.name, one.type_) for one in changes):
+            if not name:
+                return "a parameter without a name"
+            if not self._node.has_parameter(name) and not self._is_new(name):
+                near = difflib.get_close_matches(name[:100], SPECS, 1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                return f"there is no parameter {quoted(name)}{hint}"
+            if kind == Parameter.Type.NOT_SET:
+                return f"{name} is given without a value"
+        return ""
 
     def _is_new(self, full: str) -> bool:
         """Whether it is a setting that a camera may have for itself, and has not."""
@@ -180,8 +197,6 @@ class NodeParameters:
         return NodeSettings(**values)
 
     def _check(self, changes: Sequence[Parameter]) -> SetParametersResult:
-        if not all(parameter.name for parameter in changes):  # rclpy takes it for a success
-            return SetParametersResult(successful=False, reason="a parameter without a name")
         declared = {
             name: self._node.get_parameter(name).value
             for name in SPECS

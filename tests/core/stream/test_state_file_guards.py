@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
-from safetensors.torch import save_file
 
 from dyfn_core.prediction import Frame
 from dyfn_core.stream import state_file
 from dyfn_core.stream.options import StreamOptions
 from dyfn_core.stream.saving import StateError, check_folder
 from dyfn_core.stream.session import StreamSession
-from dyfn_core.stream.state_file import _digest
 from tests.core.stream.test_scene_cut import scene, seen
+from tests.support.forged_state import forge, forge_deep, hidden_of
 from tests.support.tiny_model import load_tiny
 
 
@@ -40,24 +37,6 @@ def saved(tmp_path: Path) -> Path:
     path = tmp_path / "s.safetensors"
     session().save(str(path))
     return path
-
-
-def forge(path: Path, change: Callable[[dict[str, Any], dict[str, torch.Tensor]], None]) -> None:
-    """The file with a changed description or tensors, and the digest that goes with it."""
-    with safe_open(path, "pt") as opened:
-        tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
-        content = json.loads(opened.metadata()["content"])
-    change(content, tensors)
-    text = json.dumps(content)
-    digest = _digest(text, tensors)
-    save_file(tensors, path, {"format": state_file.FORMAT, "content": text, "digest": digest})
-
-
-def hidden_of(content: dict[str, Any]) -> str:
-    memory = content["state"]["fields"]["memory"]["fields"]
-    name = memory["state"]["fields"]["hidden"]["tensor"]
-    assert isinstance(name, str)
-    return name
 
 
 def not_finite(content: dict[str, Any], tensors: dict[str, torch.Tensor]) -> None:
@@ -82,10 +61,7 @@ def test_a_forged_state_is_refused(saved: Path, change: Callable[..., None]) -> 
 
 
 def test_a_deep_description_is_refused(saved: Path) -> None:
-    deep = "[" * 100_000 + "]" * 100_000
-    tensors: dict[str, torch.Tensor] = {"0000": torch.zeros(1)}
-    metadata = {"format": state_file.FORMAT, "content": deep, "digest": _digest(deep, tensors)}
-    save_file(tensors, saved, metadata)
+    forge_deep(saved)
     with pytest.raises(StateError, match="is bad"):
         session().load(str(saved))
 

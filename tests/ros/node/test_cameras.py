@@ -248,7 +248,8 @@ def test_a_camera_s_own_value_can_be_given_later(rig: Rig) -> None:
         "nobody.max_gap": 1,
     }.items():
         result = rig.probe.set(name, value)
-        assert (result.successful, bool(result.reason)) == (False, True), name
+        assert not result.successful, name
+        assert name.partition(".")[2] in result.reason or "parameter type" in result.reason
     listed = rig.probe.call(ListParameters, "list_parameters", ListParameters.Request()).result
     assert not {name for name in listed.names if name.startswith("front.")}
     assert {name for name in listed.names if name.startswith("left.")} == {

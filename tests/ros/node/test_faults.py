@@ -26,6 +26,7 @@ def bench_of() -> Iterator[Callable[[Kind], Bench]]:
         def bench_of(kind: Kind) -> Bench:
             if not now or now[-1][0] is not kind:
                 stack.pop_all().close()
+                now.clear()
                 domain = stack.enter_context(own_domain())
                 now.append((kind, stack.enter_context(kind.open(domain))))
             return now[-1][1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import gc
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,14 @@ import cv2
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Log
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 from torch import Tensor
 
 from dyfn_core.models.base import Latent
+from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.node import StreamDepthNode
@@ -94,8 +98,14 @@ class Recovery:
 class Bench:
     """Sends to the node, and keeps what it says: log, diagnostics, answers, depth."""
 
-    def __init__(self, node: StreamDepthNode, probe: Probe, cameras: Sequence[str]) -> None:
-        self.node, self.probe = node, probe
+    def __init__(
+        self,
+        node: StreamDepthNode,
+        probe: Probe,
+        cameras: Sequence[str],
+        domain: dict[str, str],
+    ) -> None:
+        self.node, self.probe, self.domain = node, probe, domain
         self.said: list[str] = []  # "WARN text", "diagnostics ERROR text", "answer text"
         self.now = 1_000 * 10**9  # stamp of the last picture, nanoseconds
         self._count = 0
@@ -114,9 +124,21 @@ class Bench:
             level = OF_DIAGNOSTICS[status.level]
             self.said.append(f"diagnostics {level} {status.name}: {status.message}")
 
-    def answer(self, text: str) -> None:
-        """A service's."""
-        self.said.append(f"answer {text}")
+    def ask(self, kind: Any, name: str, request: Any) -> Any:
+        """A service of the node. -> its answer; a reason in it is kept."""
+        answer = self.probe.call(kind, name, request)
+        for one in getattr(answer, "results", [getattr(answer, "result", answer)]):
+            text = getattr(one, "reason", "") or getattr(one, "message", "")
+            if text:
+                self.said.append(f"answer {text}")
+        return answer
+
+    def set(self, name: str, value: Any) -> bool:
+        """-> whether it was taken."""
+        message = Parameter(name, value=value).to_parameter_msg()
+        request = SetParameters.Request(parameters=[message])
+        (result,) = self.ask(SetParameters, "set_parameters", request).results
+        return bool(result.successful)
 
     def wait_said(self, pattern: str, since: int) -> str:
         """What matches in a line, of those after the first `since`."""
@@ -163,19 +185,21 @@ class Bench:
     def work(self, camera: str, message: Any, stamp: int | None = None) -> np.ndarray | None:
         """Send a picture and wait until the node is done with it. -> its depth, if there is one."""
         stamp = self.step() if stamp is None else stamp
-        before, known = self.done(camera), len(self.depths(camera, stamp))
+        lost, known = self.lost(camera), len(self.depths(camera, stamp))
         self.send(camera, message, stamp)
-        self.probe.wait(lambda: self.done(camera) != before, PATIENCE)
-        if self.done(camera)[0] == before[0]:
-            return None
-        self.probe.wait(lambda: len(self.depths(camera, stamp)) > known, PATIENCE)
-        return self.depths(camera, stamp)[-1]
 
-    def done(self, camera: str) -> tuple[int, int, int]:
-        """Pictures that the node has published depth of, could not use, and failed on."""
+        def done() -> bool:
+            return len(self.depths(camera, stamp)) > known or self.lost(camera) > lost
+
+        self.probe.wait(done, PATIENCE)
+        found = self.depths(camera, stamp)
+        return found[-1] if len(found) > known else None
+
+    def lost(self, camera: str) -> int:
+        """Pictures that the node could not use, or failed on."""
         (found,) = (one for one in self.node._cameras if one.name == camera)
         counts = found.statistics.counts
-        return counts["published"], counts["bad"], counts["failed"]
+        return counts["bad"] + counts["failed"]
 
     def right(self, depth: np.ndarray, image: np.ndarray) -> bool:
         """Whether the depth is that of the scene, nearly everywhere."""
@@ -199,8 +223,11 @@ class Bench:
 
 
 @contextmanager
-def faulty_bench(domain: dict[str, str], cameras: Sequence[str] = (RAW, PACKED)) -> Iterator[Bench]:
+def faulty_bench(
+    domain: dict[str, str], cameras: Sequence[str] = (RAW, PACKED), **parameters: Any
+) -> Iterator[Bench]:
     """A node with such cameras and the client, which have seen each other."""
+    gc.collect()  # rcl keeps a node while Python does, and the next of its name has no /rosout
     values: dict[str, Any] = {
         "cameras": f"[{', '.join(cameras)}]",
         "device": "cpu",
@@ -210,12 +237,13 @@ def faulty_bench(domain: dict[str, str], cameras: Sequence[str] = (RAW, PACKED))
     }
     for camera in cameras:
         values.update({f"{camera}.{name}": value for name, value in CAMERAS[camera].items()})
+    values.update(parameters)
     arguments = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
     probe = Probe(domain)
     try:
         with running_node(domain, arguments, _load, counted=True) as node:
             _say_everything(node)
-            bench = Bench(node, probe, cameras)
+            bench = Bench(node, probe, cameras, domain)
             for camera in cameras:
                 bench.recover(camera)
             yield bench
@@ -224,7 +252,10 @@ def faulty_bench(domain: dict[str, str], cameras: Sequence[str] = (RAW, PACKED))
 
 
 def _load(name: str, device: str) -> FaultyPinhole:
-    return FaultyPinhole().eval()
+    model = FaultyPinhole()
+    # The identity, whatever it remembers: the right depth stays known.
+    model.stabilizer = build_dyfn(3, DyFNConfig(hidden=4, form="residual"))
+    return model.eval()
 
 
 def _say_everything(node: StreamDepthNode) -> None:

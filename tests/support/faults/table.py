@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.support.faults import pictures
+from tests.support.faults import pictures, requests
 from tests.support.faults.bench import Bench, faulty_bench
 from tests.support.faults.fault import Fault, Row, run
 from tests.support.ros_graph import own_domain
@@ -30,7 +30,10 @@ class Kind:
     open: Callable[[dict[str, str]], AbstractContextManager[Bench]] = faulty_bench
 
 
-KINDS = (Kind("Pictures", pictures.FAULTS),)
+KINDS = (
+    Kind("Pictures", pictures.FAULTS),
+    Kind("Requests", requests.FAULTS),
+)
 
 
 def happened(kind: Kind, report: Callable[[str], None]) -> list[Row]:
