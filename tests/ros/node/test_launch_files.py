@@ -21,8 +21,9 @@ every_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.name.s
 
 
 def of_stream_depth(path: Path, **arguments: str) -> Process:
+    """The first of its nodes."""
     found = processes(path, **arguments)
-    (ours,) = [one for one in found if one.executable == "stream_depth"]
+    ours = next(one for one in found if one.executable == "stream_depth")
     assert ours.package == "dyfn_ros"
     return ours
 
