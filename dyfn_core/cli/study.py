@@ -39,7 +39,13 @@ def run(options: argparse.Namespace) -> int:
     draw_grid(grid, options.out / "statistics_grid.png")
     write_grid(grid, options.out / "statistics_grid.csv", options.out / "statistics_grid.json")
     print(text_table(grid_ranges(grid)))
-    print(f"{grid.frames} frames of {sequence.name}; figure and tables in {options.out}")
+    print(
+        f"{options.model} ({model.quantity}), {grid.frames} frames of {sequence.name}; figure and "
+        f"tables in {options.out}"
+    )
+    if grid.unmasked:
+        told = f"the model marks no pixel as valid in {grid.unmasked} frames: all were compared"
+        print(f"dyfn-eval: {told}", file=sys.stderr)
     for text in lost:
         print(f"dyfn-eval: loss: {text}", file=sys.stderr)
     return PARTIAL if lost else COMPLETE

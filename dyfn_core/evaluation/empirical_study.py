@@ -14,7 +14,7 @@ from torch import Tensor
 
 from dyfn_core.evaluation.choices import FACTORS
 from dyfn_core.evaluation.report.html import Table
-from dyfn_core.models.base import GeometryModel, Latent
+from dyfn_core.models.base import Affine, AffineDisparity, GeometryModel, Latent
 from dyfn_core.models.dyfn import EPSILON
 
 
@@ -24,6 +24,9 @@ class StatisticsGrid:
 
     scale, shift: the least squares fit original z = scale * changed z + shift; shift in units of
     the original's median depth. abs_rel: error of the changed z after it, against the original.
+    For z stands the disparity of models that give it. Where the model gives no geometry for the
+    original latent, as in the sky, nothing is compared. unmasked: frames where the model gives none
+    at all, as an untrained one, and every pixel is compared.
     """
 
     factors: tuple[float, ...]
@@ -31,6 +34,7 @@ class StatisticsGrid:
     shift: np.ndarray
     abs_rel: np.ndarray
     frames: int
+    unmasked: int
 
 
 def change_statistics(features: Tensor, a: float, b: float) -> Tensor:
@@ -50,22 +54,34 @@ def statistics_grid(
     if not factors or not all(np.isfinite(f) and f > 0 for f in factors):
         raise ValueError(f"factors of the statistics must be above 0, got {factors}")
     total, frames = np.zeros((len(factors), len(factors), 3)), 0
+    unmasked = 0
     for latent in latents:
-        original = _depth(model, latent)
+        decoded = model.decode(latent)
+        valid = valid_pixels(decoded, model).cpu().numpy()
+        unmasked += not valid.any()
+        original = np.where(valid if valid.any() else True, _values(decoded), np.nan)
         for row, a in enumerate(factors):
             for column, b in enumerate(factors):
                 changed = replace(latent, features=change_statistics(latent.features, a, b))
-                total[row, column] += _fit(_depth(model, changed), original)
+                total[row, column] += _fit(_values(model.decode(changed)), original)
         frames += 1
     if not frames:
         raise ValueError("no frame to change the statistics of")
     mean = total / frames
-    return StatisticsGrid(tuple(factors), mean[..., 0], mean[..., 1], mean[..., 2], frames)
+    return StatisticsGrid(
+        tuple(factors), mean[..., 0], mean[..., 1], mean[..., 2], frames, unmasked
+    )
 
 
-def _depth(model: GeometryModel, latent: Latent) -> np.ndarray:
-    depth = model.decode(latent).values.double().cpu().numpy()
-    return np.asarray(depth).ravel()
+def valid_pixels(decoded: Affine, model: GeometryModel) -> Tensor:
+    """B x H x W bool: where the model gives geometry at all, which sky is not."""
+    if isinstance(decoded, AffineDisparity):
+        return decoded.disparity > 0
+    return (decoded.mask > model.mask_threshold) & (decoded.values > 0)
+
+
+def _values(decoded: Affine) -> np.ndarray:
+    return np.asarray(decoded.values.double().cpu().numpy())
 
 
 def _fit(changed: np.ndarray, original: np.ndarray) -> tuple[float, float, float]:
@@ -101,6 +117,7 @@ def write_grid(grid: StatisticsGrid, csv_path: Path, json_path: Path) -> None:
     content = {
         "factors": list(grid.factors),
         "frames": grid.frames,
+        "unmasked_frames": grid.unmasked,
         "scale": grid.scale.tolist(),
         "shift_over_median_depth": grid.shift.tolist(),
         "abs_rel": grid.abs_rel.tolist(),

@@ -6,11 +6,12 @@ import json
 import logging
 import os
 import re
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from dyfn_core.models.formats import CheckpointError
 
@@ -46,6 +47,8 @@ _UNSUPPORTED = (
 WEIGHTS, CONFIG = "model.safetensors", "config.json"  # in repositories of models of this project
 LIBRARY = "dyfn_ros"  # in their config.json
 ANSWER = 4.0  # seconds that the Hub has to answer
+MOST_FILES = 8  # of a repository that a message lists
+Answer = TypeVar("Answer")
 
 _HUB_ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+)(/(?P<file>.+))?")
 
@@ -175,39 +178,58 @@ def fetch(repo: str, file: str, wanted: str = "", asked: Asked | None = None) ->
         absent = isinstance(error, EntryNotFoundError)
         if wanted and absent and not isinstance(error, LocalEntryNotFoundError):
             raise CheckpointError(
-                f"Hub model {repo} is not supported: it has no {file} that says what it is; "
-                f"{_choice()}. {_by_file(repo)}"
+                f"Hub model {repo} is not supported: it has no {file} that says what it is"
+                f"{_listed(repo, asked)}; {_choice()}. {_by_file(repo)}"
             ) from error
         raise FileNotFoundError(_unavailable(repo, wanted or file, asked, error)) from error
 
 
 def _ask(repo: str, file: str, asked: Asked) -> None:
-    """Raises what the Hub answers, or TimeoutError, within ANSWER seconds.
-
-    Without a network hf_hub_download tries again for 25 s, and a timeout of one connection is
-    neither that of a name's resolution nor that of all addresses behind the name.
-    """
+    """Raises what the Hub answers, or TimeoutError, within ANSWER seconds."""
     from huggingface_hub import constants, get_hf_file_metadata, hf_hub_url
 
     if constants.HF_HUB_OFFLINE:
         return  # huggingface_hub says so itself
     url = hf_hub_url(repo, file, revision=asked.revision)
-    answers: SimpleQueue[Exception | None] = SimpleQueue()
+    _answered(url, lambda: get_hf_file_metadata(url, token=asked.token, timeout=ANSWER))
+
+
+def _listed(repo: str, asked: Asked) -> str:
+    """The names of a repository's files, as the end of a sentence; "" when they cannot be had."""
+    from huggingface_hub import HfApi
+
+    api = HfApi(token=asked.token)
+    try:
+        names = _answered(repo, lambda: api.list_repo_files(repo, revision=asked.revision))
+    except Exception:  # the refusal stands without it
+        return ""
+    shown = [name for name in sorted(names) if not name.startswith(".")]
+    more = f" and {len(shown) - MOST_FILES} more" if len(shown) > MOST_FILES else ""
+    return f"; it has {', '.join(shown[:MOST_FILES])}{more}" if shown else ""
+
+
+def _answered(what: str, question: Callable[[], Answer]) -> Answer:
+    """What a question to the Hub gives or raises, or TimeoutError, within ANSWER seconds.
+
+    Without a network hf_hub_download tries again for 25 s, and the timeout of a connection bounds
+    neither the resolution of a name nor the trial of all addresses behind it.
+    """
+    answers: SimpleQueue[tuple[Answer | None, Exception | None]] = SimpleQueue()
 
     def ask() -> None:
         try:
-            get_hf_file_metadata(url, token=asked.token, timeout=ANSWER)
-            answers.put(None)
+            answers.put((question(), None))
         except Exception as error:  # handed to the caller's thread
-            answers.put(error)
+            answers.put((None, error))
 
     Thread(target=ask, daemon=True).start()
     try:
-        answer = answers.get(timeout=ANSWER)
+        answer, error = answers.get(timeout=ANSWER)
     except Empty:
-        raise TimeoutError(f"no answer within {ANSWER:g} s from {url}") from None
-    if answer is not None:
-        raise answer
+        raise TimeoutError(f"no answer within {ANSWER:g} s from {what}") from None
+    if error is not None:
+        raise error
+    return cast(Answer, answer)
 
 
 def _unavailable(repo: str, file: str, asked: Asked, error: Exception) -> str:

@@ -14,7 +14,10 @@ import torch
 from dyfn_core.cli import reconstruct, study
 from dyfn_core.cli.eval import main
 from dyfn_core.evaluation.empirical_study import statistics_grid
-from dyfn_core.models.base import Latent
+from dyfn_core.models.base import AffinePoints, Latent
+from dyfn_core.models.checkpoints import load_model, save_model
+from tests.support.bases import moge2_config, small_da3, small_moge2
+from tests.support.fake_hub import fake_hub
 from tests.support.made_room import FOCAL, SIZE, room_frame
 from tests.support.pinhole import PinholeModel
 from tests.support.seeded import uniform
@@ -104,6 +107,78 @@ def test_study_writes_figure_csv_and_json(
     assert len(rows) == 9
     assert float(rows[5]["scale"]) == found["scale"][1][2]
     assert cv2.imread(str(tmp_path / "statistics_grid.png")).std() > 20
+
+
+BASES = {
+    "moge2": small_moge2,
+    "DA3MONO": lambda: small_da3("mono"),
+    "DA3METRIC": lambda: small_da3("metric"),
+}
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_study_runs_on_todays_bases(
+    base: str,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """At a = b = 1 nothing moves, to the solve's error; elsewhere scale or shift do."""
+    monkeypatch.setattr(study, "load_model", load_model)
+    save_model(BASES[base](), tmp_path / "base.safetensors")
+    words = ["study", str(room), "--out", str(tmp_path), "--frames", "1", "--num-tokens", "12"]
+    words += ["--model", str(tmp_path / "base.safetensors"), "--factors", "0.5", "1"]
+    assert main(words) == 0
+    found = json.loads((tmp_path / "statistics_grid.json").read_text())
+    assert found["scale"][1][1] == pytest.approx(1, abs=3e-3)
+    assert found["shift_over_median_depth"][1][1] == pytest.approx(0, abs=3e-3)
+    assert found["abs_rel"][1][1] < 1e-3
+    assert abs(found["scale"][1][0] - 1) > 0.02
+    assert found["unmasked_frames"] == 0
+    told = "affine_depth" if base == "DA3MONO" else "depth"
+    assert f"base.safetensors ({told}), 1 frames of " in capsys.readouterr().out
+
+
+def test_study_takes_a_hub_id_or_refuses_it(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(study, "load_model", load_model)
+    content = {"model_config": moge2_config(), "model": small_moge2().state_dict()}
+    torch.save(content, tmp_path / "model.pt")
+    hub = fake_hub(monkeypatch, tmp_path, {"model.pt": tmp_path / "model.pt"})
+    words = ["study", str(room), "--out", str(tmp_path), "--frames", "1", "--num-tokens", "12"]
+    assert main([*words, "--factors", "1", "--model", "Ruicheng/moge-2-vits-normal"]) == 0
+    assert "Ruicheng/moge-2-vits-normal (depth), 1 frames" in capsys.readouterr().out
+    assert hub.downloads == ["model.pt"]
+    assert main([*words, "--model", "depth-anything/DA3-LARGE"]) == 2
+    assert "is Depth Anything 3 for several views" in capsys.readouterr().err
+    assert hub.downloads == ["model.pt"]
+
+
+def test_study_leaves_out_what_is_no_geometry() -> None:
+    """A red half of the picture is a wall, the other half sky, whose values say nothing."""
+    red = 0.4 + 0.2 * uniform(0, 1, 1, 12, 16)
+    latent = Latent(torch.cat([red, 0 * red, 0 * red], 1), (12, 16), (12, 16))
+    model = HalfSky().eval()
+    grid = statistics_grid(model, [latent], (0.5, 1.0, 2.0))
+    np.testing.assert_allclose(grid.scale, np.tile([2, 1, 0.5], (3, 1)), rtol=2e-3)
+    assert grid.abs_rel.max() < 1e-4
+    model.mask_threshold = 2.0
+    assert grid.unmasked == 0
+    assert statistics_grid(model, [latent], (1.0,)).unmasked == 1
+
+
+class HalfSky(PinholeModel):
+    """Its right half is no geometry and random at every call."""
+
+    def decode(self, latent: Latent) -> AffinePoints:
+        affine = super().decode(latent)
+        half = affine.mask.shape[-1] // 2
+        points, mask = affine.points.clone(), torch.ones_like(affine.mask)
+        points[..., half:, 2] = torch.rand_like(points[..., half:, 2])
+        mask[..., half:] = 0
+        return AffinePoints(points, mask)
 
 
 def test_a_linear_decoder_turns_statistics_into_scale_and_shift() -> None:

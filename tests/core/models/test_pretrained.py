@@ -14,7 +14,6 @@ import pytest
 import torch
 import yaml
 from huggingface_hub import HfApi, ModelCard
-from huggingface_hub.errors import EntryNotFoundError
 from safetensors.torch import load
 
 import dyfn_core
@@ -27,6 +26,7 @@ from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.model_card import COUNTERS, LICENSES, without_folders
 from dyfn_core.training.loop import trainer
 from tests.support.bases import moge2_config, small_moge2
+from tests.support.fake_hub import FakeHub, fake_hub
 
 FACTS = ModelFacts(
     base_model="dyfn-mini",
@@ -228,32 +228,10 @@ def test_missing_and_damaged_files_are_named(folder: Path, tmp_path: Path) -> No
         DyFNModel.from_pretrained(folder, map_location="cpu")
 
 
-class FakeHub:
-    """Repositories in memory; what is asked of them, and where it was put."""
-
-    def __init__(self, blobs: Path, files: dict[str, Path]) -> None:
-        self.blobs, self.files = blobs, files
-        self.asked: list[tuple[str, dict[str, Any]]] = []
-
-    def metadata(self, url: str, **options: Any) -> None:
-        self.asked.append((url, options))
-        if url.rpartition("/")[2] not in self.files:
-            raise EntryNotFoundError("404")
-
-    def download(self, repo_id: str, filename: str, **options: Any) -> str:
-        self.asked.append((filename, options))
-        return str(self.files[filename])
-
-
 @pytest.fixture
 def hub(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeHub:
     """One repository, which is what save_pretrained wrote."""
-    fake = FakeHub(tmp_path, {path.name: path for path in folder.iterdir()})
-    monkeypatch.setenv("DYFN_MODELS", str(tmp_path / "by_hand"))
-    monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *_, **__: None)
-    monkeypatch.setattr("huggingface_hub.get_hf_file_metadata", fake.metadata)
-    monkeypatch.setattr("huggingface_hub.hf_hub_download", fake.download)
-    return fake
+    return fake_hub(monkeypatch, tmp_path, {path.name: path for path in folder.iterdir()})
 
 
 def test_hub_is_asked_as_told(hub: FakeHub, tmp_path: Path) -> None:
@@ -279,7 +257,8 @@ def test_a_foreign_repository_is_refused_before_its_weights(hub: FakeHub, folder
     with pytest.raises(CheckpointError, match=r"'library': 'transformers'.*supported are"):
         DyFNModel.from_pretrained("me/mine")
     del hub.files["config.json"]
-    with pytest.raises(CheckpointError, match=r"it has no config\.json that says what it is"):
+    told = r"no config\.json that says what it is; it has README\.md, model\.safetensors; supported"
+    with pytest.raises(CheckpointError, match=told):
         DyFNModel.from_pretrained("me/mine")
     assert not any("safetensors" in name for name, _ in hub.asked)
 
