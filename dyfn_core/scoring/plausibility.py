@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from array import array
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ EDGES_LOOKED_AT = 64  # frames of a sequence, evenly spread
 MIN_AGREEMENT = 0.9  # see EdgeAgreement
 VALUES = 4096  # of a frame's truth, for its median
 SAMPLED = 4  # every so many rows and columns tell frames apart
+LONE_SHARE, LONE_RATIO = 0.005, 2.0  # of the pixels, and over all other depths: see _doubted_top
 REPEATED = 0.5  # of the frames: more that repeat the truth before them are doubted
 
 
@@ -31,12 +33,14 @@ class Remedies:
         stamps: Against stamps that do not rise.
         truth: Against truth of something else.
         camera: Against wrong intrinsics.
+        far: Against values that are too far.
     """
 
     unit: str = ""
     stamps: str = ""
     truth: str = ""
     camera: str = ""
+    far: str = ""
 
 
 class Plausibility:
@@ -55,6 +59,7 @@ class Plausibility:
         self._frames = 0
         self._edges = EdgeAgreement()
         self._medians = array("f")  # of the frames with truth
+        self._tops: Counter[float] = Counter()  # largest depths of many pixels, far beyond others
         self._flat = 0  # of these, those with one depth all over
         self._first: tuple[int, int] | None = None  # marks of the first pair
         self._last: tuple[int, int] | None = None
@@ -95,9 +100,18 @@ class Plausibility:
         depth = depth[:: max(1, depth.size // VALUES)]
         self._medians.append(float(np.median(depth)))
         self._flat += bool(depth.max() - depth.min() <= 1e-6 * depth.max())
+        self._take_top(depth)
         self._compare((_mark(image), _mark(truth)))
         if index % self._every == 0:
             self._edges.push(image, truth)
+
+    def _take_top(self, depth: np.ndarray) -> None:
+        top = depth.max()
+        others = depth[depth < top]
+        if others.size == 0 or depth.size - others.size < LONE_SHARE * depth.size:
+            return
+        if top > LONE_RATIO * others.max():
+            self._tops[float(top)] += 1
 
     def _compare(self, pair: tuple[int, int]) -> None:
         if self._first is None or self._last is None:
@@ -108,11 +122,12 @@ class Plausibility:
             self._frozen += pair[1] == self._last[1] and pair[0] != self._last[0]
         self._last = pair
 
-    def warnings(self, scored: int | None) -> list[str]:
+    def warnings(self, scored: int | None, farthest: float = math.inf) -> list[str]:
         """One sentence for each thing that is doubted.
 
         Args:
             scored: How many of the frames were scored; None when none were to be.
+            farthest: Metres up to which truth was scored.
         """
         found = [self._doubted_stamps(), self._camera and f"{self._camera}{self._remedies.camera}"]
         if scored is not None and self._frames and scored < self._frames / 2:
@@ -121,7 +136,7 @@ class Plausibility:
                 "no ground truth or no depth, or too little of them in common"
             )
         if self._medians:
-            found += [self._doubted_unit(), self._doubted_pairs()]
+            found += [self._doubted_unit(), self._doubted_top(farthest), self._doubted_pairs()]
         return [text for text in found if text]
 
     def _doubted_stamps(self) -> str:
@@ -141,6 +156,17 @@ class Plausibility:
             f"the median of the true depth is {median:.4g} m, expected {NEAREST:g} to "
             f"{FARTHEST:g} m{guess}{self._remedies.unit}"
         )
+
+    def _doubted_top(self, farthest: float) -> str:
+        """Of depth that is one value wherever nothing was measured."""
+        for top, count in self._tops.most_common(1):
+            if count >= MIN_FRAMES and top <= farthest:
+                return (
+                    f"the true depth is {top:g} m in many pixels of {count} frames and less than "
+                    f"{top / LONE_RATIO:g} m in all others of them: a word for no depth?"
+                    f"{self._remedies.far}"
+                )
+        return ""
 
     def _doubted_pairs(self) -> str:
         """The strongest of the reasons why truth and pictures do not belong together."""

@@ -43,13 +43,14 @@ def decode_camera_info(
 ) -> CameraCalibration:
     """sensor_msgs/CameraInfo -> the intrinsics of an image of height x width pixels.
 
-    rectified: take P, which describes rectified images, instead of K.
+    rectified: take P, which describes rectified images, instead of K and D; K where P is empty
+    and D too.
     Raises MessageError: uncalibrated (K[0] == 0), no pinhole matrix, one of no real camera, D that
     is not finite, another size than the image.
     """
     k = _field(info, "k")
     matrix = np.array(k, np.float64).reshape(3, 3)
-    if rectified:
+    if rectified and (any(_field(info, "p")) or any(_field(info, "d"))):
         matrix = np.array(_field(info, "p"), np.float64).reshape(3, 4)[:, :3].copy()
     if matrix[0, 0] == 0:
         raise MessageError(f"uncalibrated: {'P' if rectified else 'K'}[0] is 0")

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from dyfn_ros.messages.encodings import MessageError, metres_per_value
+from dyfn_ros.messages.encodings import FULL, MessageError, metres_per_value
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.messages.picture_size import PNG, check_picture_size
 from dyfn_ros.messages.rvl import decode_rvl
@@ -25,13 +25,15 @@ def is_compressed_depth(message: Any) -> bool:
     return data.startswith(PNG) and data[24:26] == b"\x10\x00"
 
 
-def decode_compressed_depth(message: Any, scale: float | None = None) -> np.ndarray:
+def decode_compressed_depth(
+    message: Any, scale: float | None = None, *, full: bool = False
+) -> np.ndarray:
     """CompressedImage with depth -> H x W float32 metres, NaN where there is none.
 
     16-bit PNG in millimetres, plain or as compressedDepth, which may be RVL as well;
     compressedDepth of 32FC1 is inverse depth. scale: values per metre, instead of 1000, and 1 for
-    32FC1. Raises MessageError for anything else, naming the
-    format, and for more than MAX_PIXELS.
+    32FC1. full: the largest value that 16 bits have is valid where they are depth. Raises
+    MessageError for anything else, naming the format, and for more than MAX_PIXELS.
     """
     layout, data = str(message.format), bytes(message.data)
     inverse: tuple[float, float] | None = None
@@ -51,6 +53,8 @@ def decode_compressed_depth(message: Any, scale: float | None = None) -> np.ndar
             metres = (inverse[0] / (metres - inverse[1])).astype(np.float32)
     metres *= np.float32(metres_per_value("16UC1" if inverse is None else "32FC1", scale))
     valid = (values > 0) & np.isfinite(metres) & (metres > 0)
+    if inverse is None and not full:
+        valid &= values < FULL
     result: np.ndarray = np.where(valid, metres, np.float32(np.nan))
     return result
 

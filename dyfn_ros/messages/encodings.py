@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 FULL_BITS = 16
+FULL = (1 << FULL_BITS) - 1  # of 16-bit depth: beyond what can be said, or a word for none
 _SHOWN = 40  # characters of a name that a message made up
 
 
@@ -291,13 +292,14 @@ def metres_per_value(encoding: str, scale: float | None = None) -> float:
 
 
 def decode_metric_depth(
-    raster: Raster, *, zero: bool = False, scale: float | None = None
+    raster: Raster, *, zero: bool = False, full: bool = False, scale: float | None = None
 ) -> np.ndarray:
     """-> H x W float32 metres, NaN where there is no depth (REP-118).
 
-    16UC1 and mono16 are millimetres, 0 invalid; 32FC1 is metres, where zero, negative and
+    16UC1 and mono16 are millimetres, 0 and FULL invalid; 32FC1 is metres, where zero, negative and
     non-finite values are invalid. zero: a 0 of 32FC1 is valid, as it is of disparity (far away).
-    scale: stored values per metre, instead of 1000 and 1.
+    full: FULL is valid, as it is of inverse depth (near). scale: stored values per metre, instead
+    of 1000 and 1.
     Raises MessageError as decode_colour does.
     """
     if raster.encoding not in DEPTH_ENCODINGS:
@@ -310,7 +312,7 @@ def decode_metric_depth(
         valid = depth >= 0 if zero else depth > 0
     else:
         depth = _rows(raster, "u2", 1)[..., 0].astype(np.float32)
-        valid = depth > 0
+        valid = (depth > 0) & (full | (depth < FULL))
     depth *= np.float32(metres_per_value(raster.encoding, scale))
     depth[~(np.isfinite(depth) & valid)] = np.nan
     return depth

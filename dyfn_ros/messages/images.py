@@ -59,12 +59,14 @@ def decode_image(message: Any, most: int = MAX_PIXELS, bits: int = FULL_BITS) ->
     return decode_colour(_raster(message, bits))
 
 
-def decode_depth(message: Any, *, zero: bool = False, scale: float | None = None) -> np.ndarray:
+def decode_depth(
+    message: Any, *, zero: bool = False, full: bool = False, scale: float | None = None
+) -> np.ndarray:
     """sensor_msgs/Image with depth -> H x W float32 metres, NaN invalid. Raises MessageError.
 
-    zero, scale: see decode_metric_depth.
+    zero, full, scale: see decode_metric_depth.
     """
-    return decode_metric_depth(_raster(message), zero=zero, scale=scale)
+    return decode_metric_depth(_raster(message), zero=zero, full=full, scale=scale)
 
 
 def depth_fields(depth: np.ndarray, valid: np.ndarray, encoding: str = "32FC1") -> dict[str, Any]:

@@ -24,6 +24,7 @@ class RecordedFrame:
     camera_matrix: 3 x 3 float64 in pixels; None without usable calibration.
     depth: H' x W' float32 metres, NaN invalid; None without ground truth for this stamp.
     visible: H x W bool, where undistortion found a picture; None: everywhere.
+    lens_undone: whether the image as recorded had a lens, which `info` describes.
     source, info: the image and the latest CameraInfo as recorded (or made, for an RGB-D folder).
     """
 
@@ -36,6 +37,7 @@ class RecordedFrame:
     source: Recorded
     info: Recorded | None
     visible: np.ndarray | None = None
+    lens_undone: bool = False
 
 
 @dataclass

@@ -18,6 +18,7 @@ from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.messages.rectify import PinholeImage, undistort_depth
 from dyfn_ros.messages.references import Transform, decode_points
 from dyfn_ros.recordings.storage.base import Recorded
+from dyfn_ros.recordings.topics import is_rectified
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, POINT_CLOUD
 
 SAME = 2e-3  # of the image's width and height: intrinsics that differ by less are the same
@@ -61,7 +62,7 @@ class GroundTruth:
         if recorded.kind == POINT_CLOUD:
             return self._cloud(message, view, frame_id)
         depth = self._image(message, recorded.kind == COMPRESSED_IMAGE)
-        calibration = self._calibration(info, depth)
+        calibration = self._calibration(info, depth, is_rectified(recorded.topic))
         if self._transform is not None and (calibration is None or view.matrix is None):
             raise MessageError("a transform needs the intrinsics of the image and of the depth")
         if calibration is None or view.matrix is None:
@@ -82,9 +83,12 @@ class GroundTruth:
         return register_depth(depth, calibration.matrix, view.matrix, size, self._transform)
 
     def _image(self, message: Any, compressed: bool) -> np.ndarray:
+        full = self._quantity != DEPTH
         if compressed:
-            return scored_values(decode_compressed_depth(message, self._scale), self._quantity)
-        stored = decode_depth(message, zero=self._quantity == DISPARITY, scale=self._scale)
+            stored = decode_compressed_depth(message, self._scale, full=full)
+            return scored_values(stored, self._quantity)
+        zero = self._quantity == DISPARITY
+        stored = decode_depth(message, zero=zero, full=full, scale=self._scale)
         return scored_values(stored, self._quantity)
 
     def _cloud(self, message: Any, view: PinholeImage, frame_id: str) -> np.ndarray:
@@ -96,11 +100,13 @@ class GroundTruth:
             points = self._transform(points)
         return render_depth(points, view.matrix, (view.image.shape[0], view.image.shape[1]))
 
-    def _calibration(self, info: Any, depth: np.ndarray) -> CameraCalibration | None:
+    def _calibration(
+        self, info: Any, depth: np.ndarray, rectified: bool
+    ) -> CameraCalibration | None:
         if info is None:
             return None
         try:
-            return decode_camera_info(info, depth.shape[0], depth.shape[1])
+            return decode_camera_info(info, *depth.shape, rectified=rectified)
         except MessageError as error:
             self._warn(f"its CameraInfo {error}; taken as registered to the image")
             return None

@@ -30,7 +30,7 @@ from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.ground_truth import GroundTruth
 from dyfn_ros.recordings.storage.base import Recorded, Storage
-from dyfn_ros.recordings.topics import Topics, topic_remarks
+from dyfn_ros.recordings.topics import Topics, is_rectified, topic_remarks
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 from dyfn_ros.recordings.video_topic import VideoTopic, is_video
 
@@ -53,7 +53,7 @@ class BagRecording:
         self.path = path
         self.topics = topics
         self.notes = Notes()
-        self._rules = RectifyRules()
+        self._rules = RectifyRules(rectified=is_rectified(topics.image))
         self._storage = storage
         self._tolerance_ns = round(tolerance * 1e9)
         self._truth = GroundTruth(transform, self._assumed, quantity, depth_scale)
@@ -240,6 +240,7 @@ class BagRecording:
             source=image.recorded,
             info=infos.recorded,
             visible=view.visible,
+            lens_undone=view.lens is not None,
         )
 
     def _decode_depth(

@@ -37,6 +37,7 @@ _OTHER_LIGHT = re.compile(
     r"|(?:^|[/_])n?ir_?\d*(?:[/_]|$)"
 )
 _SAYS_DEPTH = re.compile(r"depth|range|distance|(?:^|[/_])(?:tof|z)\d*(?:[/_]|$)")
+_RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 WIDE_GREY = {"mono16", *DEPTH_ENCODINGS}  # what shows no colours
 # Parts of names that say what an image is, not whose.
 _WHAT = re.compile(
@@ -166,6 +167,13 @@ def _depth_remarks(
             f"{truth} is the only depth, in another namespace than {image}: of another camera? "
             "--depth-topic none does without"
         )
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether images are rectified by their topic's name, as image_proc gives it: P of their
+    CameraInfo describes them, and K and D the images that they were made of."""
+    parts = TRANSPORTS.sub("", topic).lower().rsplit("/", 2)
+    return any(_RECTIFIED.search(part) for part in parts[-2:])
 
 
 def topic_remarks(storage: Storage, topics: Topics) -> list[str]:

@@ -12,10 +12,8 @@ from dyfn_core.evaluation.report.colours import colour_depth, depth_range
 from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_core.scoring.protocols import sample_grid
-from dyfn_ros.messages.camera_info import decode_camera_info
 from dyfn_ros.messages.clouds import CLOUD_OFFSETS, CLOUD_STEP, pack_cloud
 from dyfn_ros.messages.compressed_depth import encode_depth_range
-from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import depth_fields
 from dyfn_ros.recordings.open import RecordedFrame
 from dyfn_ros.recordings.typestore import (
@@ -65,7 +63,6 @@ class ReplayRecording:
         self._frame_ids: list[str] = []
         self._image_topic = ""
         self._coarse: list[float] = []  # errors beyond it
-        self._lens: tuple[bytes, bool] | None = None
         self._ends = (np.inf, 0.0)  # of the depth as it was predicted
 
     def __enter__(self) -> ReplayRecording:
@@ -133,7 +130,7 @@ class ReplayRecording:
         """An image whose lens was undone is written so, with the CameraInfo of a pinhole: depth is
         of that image, and a reader must not undo the lens a second time."""
         source, info = frame.source, frame.info
-        undone = info is not None and self._distorted(frame)
+        undone = frame.lens_undone
         if info is not None and frame.camera_matrix is not None and undone:
             size = (frame.image.shape[0], frame.image.shape[1])
             pinhole = camera_info(frame.camera_matrix, size, frame.stamp_ns, frame.frame_id)
@@ -149,19 +146,6 @@ class ReplayRecording:
         self._writer.write_jpeg(
             self._image_topic, frame.image, frame.stamp_ns, frame.frame_id, log_ns=time
         )
-
-    def _distorted(self, frame: RecordedFrame) -> bool:
-        """Whether the image had a lens; found once for each content of CameraInfo."""
-        assert frame.info is not None
-        content = frame.info.data[12:]  # all but the CDR head and the stamp
-        if self._lens is None or self._lens[0] != content:
-            height, width = frame.image.shape[:2]
-            try:
-                lens = decode_camera_info(frame.info.message(), height, width).distorted
-            except MessageError:  # such a CameraInfo was not used
-                lens = False
-            self._lens = content, lens
-        return self._lens[1]
 
     def finish(self, spool: FrameSpool | None, run: ShownRun) -> None:
         """Add what needs the alignment of the whole recording.

@@ -24,6 +24,7 @@ from dyfn_ros.replay.settings import SessionOptions, Source
 
 REMEDIES = Remedies(
     unit="; --depth-scale gives the stored values per metre",
+    far="; --depth-max leaves them out",
     stamps="; --stamps log takes the time of recording",
     truth="; --depth-topic names another, --depth-info-topic and --depth-transform register it",
     camera="; --camera-info-topic none does without",
@@ -125,14 +126,15 @@ class SourceReader:
                 if count == self._source.max_frames:
                     return
 
-    def doubts(self, scored: int) -> list[str]:
+    def doubts(self, scored: int, depth_max: float) -> list[str]:
         """What makes the scores of the frames implausible, a sentence each.
 
         Args:
             scored: How many of the frames were scored.
+            depth_max: Metres up to which.
         """
         expected = None if self.recording.topics.depth is None else scored
-        return [*self.recording.doubts(), *self._plausibility.warnings(expected)]
+        return [*self.recording.doubts(), *self._plausibility.warnings(expected, depth_max)]
 
     def references(self, options: SessionOptions) -> ReferenceFeed | None:
         """The measurements of the reference topic, from the first on.

@@ -90,7 +90,7 @@ def replay(
         reader.warn("--load-state: base model and controls started without the saved state")
     options = {**stream_facts(run), "threads": threads}
     facts = runner.facts()
-    doubts = reader.doubts(evaluation.scored_frames)
+    doubts = reader.doubts(evaluation.scored_frames, outputs.depth_max)
     result = Result(
         run.model, stabilized, evaluation, base, alone, options, files.cloud, facts, doubts
     )

@@ -58,7 +58,7 @@ def score_topic(source: Source, topic: PredictionTopic, outputs: Outputs) -> dic
         "threads": 0,
         "predicted": topic.quantity,
     }
-    doubts = reader.doubts(evaluation.scored_frames)
+    doubts = reader.doubts(evaluation.scored_frames, outputs.depth_max)
     result = Result(topic.topic, False, evaluation, None, None, options, None, doubts=doubts)
     return write_results(source, reader.recording, outputs, result)
 

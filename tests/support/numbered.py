@@ -24,13 +24,16 @@ def depth(index: int) -> np.ndarray:
 
 
 def numbers(frames: Iterable[RecordedFrame]) -> list[int | None]:
-    """Which depth each frame was paired with; checks that the values are those of that frame."""
+    """Which depth each frame was paired with; checks that the values, of which most are there, are
+    those of that frame."""
     found: list[int | None] = []
     for frame in frames:
         if frame.depth is None:
             found.append(None)
             continue
         number = int(np.nanmin(frame.depth)) - 1
-        np.testing.assert_allclose(frame.depth, depth(number), atol=2e-3)
+        there = np.isfinite(frame.depth)
+        assert there.mean() > 0.5
+        np.testing.assert_allclose(frame.depth[there], depth(number)[there], atol=2e-3)
         found.append(number)
     return found

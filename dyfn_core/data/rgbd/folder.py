@@ -13,6 +13,8 @@ from dyfn_core.data.files import read_colour, read_uint16, registered, rgbd_fram
 from dyfn_core.data.frames import DataError, FrameError, RgbdFrame, camera_intrinsics
 from dyfn_core.data.rgbd.cameras import Camera, FolderCamera, Size, laid_over, read_camera
 
+NO_DEPTH = (0, 65535)  # stored values: none, and beyond what 16 bits can say
+
 
 @dataclass(frozen=True)
 class FrameFiles:
@@ -58,7 +60,6 @@ class RgbdFolder:
         frames: in the order of time, those without depth as well.
         calibration: where the intrinsics are; they are read when they are asked for.
         unit: stored depth values per metre.
-        invalid: stored values that mean no depth, besides 0.
         depth_camera: intrinsics of the depth files, which are then laid over the images. With
             intrinsics that were given, or are in the folder, depth is taken to lie there already.
         doubts: what makes the pairs of images and depth implausible.
@@ -69,7 +70,6 @@ class RgbdFolder:
     frames: tuple[FrameFiles, ...]
     calibration: Calibration
     unit: float
-    invalid: tuple[int, ...] = ()
     depth_camera: FolderCamera | None = None
     doubts: tuple[str, ...] = ()
 
@@ -135,7 +135,7 @@ class RgbdFolder:
             return None
         stored = read_uint16(frame.depth)
         metres: np.ndarray = stored.astype(np.float32) / np.float32(self.unit)
-        metres[np.isin(stored, (0, *self.invalid))] = np.nan
+        metres[np.isin(stored, NO_DEPTH)] = np.nan
         published = self.calibration.published
         if self.depth_camera is None or published is None or self.camera is not published:
             return metres

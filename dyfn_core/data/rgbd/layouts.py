@@ -221,13 +221,13 @@ def _seven_scenes(folder: Path, report: DataReport, options: FolderOptions) -> R
     if sensor is not None:
         calibration = options.calibration(_camera_file(folder, report), sensor.camera)
         unit = options.depth_scale or sensor.unit
-        return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,))
+        return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit)
     source = "published intrinsics of 7-Scenes"
     published = FolderCamera(SEVEN_SCENES_CAMERA, source, PUBLISHED_SIZE)
     calibration = options.calibration(_camera_file(folder, report), published)
     unit = options.depth_scale or MILLIMETRES
     depth_camera = FolderCamera(SEVEN_SCENES_DEPTH, source, PUBLISHED_SIZE)
-    return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, (65535,), depth_camera)
+    return RgbdFolder(folder, SEVEN_SCENES, frames, calibration, unit, depth_camera)
 
 
 def _tum(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFolder:

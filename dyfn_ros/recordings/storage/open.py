@@ -130,6 +130,7 @@ def _open_folder(path: Path) -> Storage:
         raise RecordingError(
             f"{path}: expected a rosbag2 folder (metadata.yaml and .mcap or .db3 files) "
             f"or an RGB-D folder (rgb/, depth/, K.txt){held}{contents.problem}"
+            f"{''.join(f'; {text}' for text in contents.missing)}"
         )
     parts: dict[Path, Storage] = {}
     losses: list[str] = []
@@ -141,8 +142,9 @@ def _open_folder(path: Path) -> Storage:
     if not parts:
         raise RecordingError("; ".join([*contents.missing, *losses]))
     found = sum(topic.count for part in parts.values() for topic in part.topics.values())
+    parts, remarks = _in_time(path, parts)
     if contents.renamed and not losses and found == contents.messages:
-        remarks = [f"{f}: metadata.yaml names it otherwise" for f in contents.renamed]
+        remarks += [f"{f}: metadata.yaml names it otherwise" for f in contents.renamed]
         return ChainedStorage([*parts.values()], (), remarks)
     damaged = losses or contents.missing or any(part.losses for part in parts.values())
     others = contents.renamed or contents.unlisted
@@ -152,8 +154,25 @@ def _open_folder(path: Path) -> Storage:
         )
     listed = {file: part for file, part in parts.items() if file not in contents.renamed}
     unlisted = [*contents.unlisted, *(contents.renamed if listed else [])]
-    remarks = [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
+    remarks += [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
+    remarks += [f"{f}: not read, by its name a copy in another format" for f in contents.copies]
     return ChainedStorage([*(listed or parts).values()], [*contents.missing, *losses], remarks)
+
+
+def _in_time(folder: Path, parts: dict[Path, Storage]) -> tuple[dict[Path, Storage], list[str]]:
+    """Parts in the order of their first messages, and a sentence when that is another one."""
+    if len(parts) == 1:
+        return parts, []
+    starts: dict[Path, int] = {}
+    last = 0
+    for file, part in parts.items():
+        first = next(iter(part.messages([*part.topics])), None)
+        last = starts[file] = last if first is None else first.log_ns
+    ordered = sorted(parts, key=lambda file: starts[file])
+    if ordered == [*parts]:
+        return parts, []
+    told = f"{folder}: its files are read in the order of their first messages, not as listed"
+    return {file: parts[file] for file in ordered}, [told]
 
 
 @dataclass
@@ -162,13 +181,15 @@ class _Contents:
 
     missing: sentences about files that metadata.yaml lists and that are not there. renamed:
     those of `files` that may be the missing ones. unlisted: the others that are not listed.
-    messages: how many there are by metadata.yaml. problem: why that cannot be used.
+    copies: files of another format with the name of one of `files`. messages: how many there are
+    by metadata.yaml. problem: why that cannot be used.
     """
 
     files: list[Path]
     missing: list[str] = field(default_factory=list)
     renamed: list[Path] = field(default_factory=list)
     unlisted: list[Path] = field(default_factory=list)
+    copies: list[Path] = field(default_factory=list)
     messages: int | None = None
     problem: str = ""
 
@@ -177,12 +198,14 @@ def _contents(path: Path) -> _Contents:
     """What there is, by metadata.yaml when that can be read."""
     unlisted = _files(path)
     if not (path / "metadata.yaml").exists():
-        return _Contents(unlisted, _missing_numbers(path, unlisted))
+        files, copies = _without_copies(unlisted)
+        return _Contents(files, _missing_numbers(path, files), copies=copies)
     try:
         names, messages = _listed(path / "metadata.yaml")
     except (*DAMAGE, yaml.YAMLError) as error:  # the files speak for themselves
         problem = f"; metadata.yaml is not the YAML of a recording: {reason(error)}"
-        return _Contents(unlisted, _missing_numbers(path, unlisted), problem=problem)
+        files, copies = _without_copies(unlisted)
+        return _Contents(files, _missing_numbers(path, files), copies=copies, problem=problem)
     places = {name: _place(path, name) for name in names}
     found = [*dict.fromkeys(place for place in places.values() if place is not None)]
     unlisted = [f for f in unlisted if _plain_name(f) not in {_plain_name(p) for p in found}]
@@ -193,11 +216,24 @@ def _contents(path: Path) -> _Contents:
     ]
     if missing and len(unlisted) == len(missing):
         stand_in = iter(unlisted)
-        files = dict.fromkeys(place or next(stand_in) for place in places.values())
-        return _Contents([*files], missing, renamed=unlisted, messages=messages)
+        all_files = dict.fromkeys(place or next(stand_in) for place in places.values())
+        return _Contents([*all_files], missing, renamed=unlisted, messages=messages)
     if not found:
         return _Contents(unlisted, missing, messages=messages)
     return _Contents(found, missing, unlisted=unlisted, messages=messages)
+
+
+def _without_copies(files: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Files with different names, and those that are the same in another format by their names."""
+    kept: dict[str, Path] = {}
+    for file in sorted(files, key=lambda f: [*READERS].index(Path(_plain_name(f)).suffix.lower())):
+        kept.setdefault(_stem(file), file)
+    return [f for f in files if kept[_stem(f)] == f], [f for f in files if kept[_stem(f)] != f]
+
+
+def _stem(path: Path) -> str:
+    """Without all of the suffixes of a recording."""
+    return re.sub(r"(?i)\.(?:mcap|db3|bag|bag\.active)$", "", _plain_name(path))
 
 
 def _missing_numbers(folder: Path, files: list[Path]) -> list[str]:
@@ -273,17 +309,20 @@ def _open_file(path: Path) -> Storage:
 
 
 def _unpack(path: Path, target: Path) -> str:
-    """Unpack as much as can be; says what went wrong, "" when nothing did."""
-    decoder = zstandard.ZstdDecompressor().decompressobj()
+    """Unpack as much as can be, of one frame of zstd after the other (pzstd writes many).
+
+    Says what went wrong, "" when nothing did.
+    """
+    unpacker = zstandard.ZstdDecompressor()
+    decoder = unpacker.decompressobj()
     try:
         with path.open("rb") as source, target.open("wb") as file:
-            while not decoder.eof:
-                piece = source.read(1 << 10)  # gives at most 32 MiB
-                if not piece:
-                    return "the compressed file ends early"
+            while piece := decoder.unused_data or source.read(1 << 10):  # gives at most 32 MiB
+                if decoder.eof:
+                    decoder = unpacker.decompressobj()
                 file.write(decoder.decompress(piece))
                 if shutil.disk_usage(target.parent).free < _FREE:
                     return f"unpacked up to {file.tell()} bytes, then the disk was full"
     except DAMAGE as error:
         return f"unpacked in part: {reason(error)}"
-    return ""
+    return "" if decoder.eof else "the compressed file ends early"

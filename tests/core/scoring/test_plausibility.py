@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 from collections.abc import Callable
 
@@ -13,7 +14,7 @@ from tests.support.rectangles import MATRIX, SIZE, rectangles
 
 COUNT = 12
 Pair = tuple[np.ndarray, np.ndarray]
-REMEDIES = Remedies("; UNIT", "; STAMPS", "; TRUTH", "; CAMERA")
+REMEDIES = Remedies("; UNIT", "; STAMPS", "; TRUTH", "; CAMERA", "; FAR")
 
 
 def told(
@@ -22,6 +23,7 @@ def told(
     stamps: list[float] | None = None,
     matrix: np.ndarray | None = MATRIX,
     scored: int | None = COUNT,
+    farthest: float = math.inf,
 ) -> list[str]:
     """The warnings of COUNT frames, each changed."""
     plausibility = Plausibility(COUNT, REMEDIES)
@@ -29,7 +31,7 @@ def told(
         image, truth = change(index, rectangles(index))
         stamp = index * 0.1 if stamps is None else stamps[index]
         plausibility.push(image, truth, stamp, matrix)
-    return plausibility.warnings(scored)
+    return plausibility.warnings(scored, farthest)
 
 
 def one(texts: list[str]) -> str:
@@ -51,6 +53,37 @@ def test_a_median_beyond_is_not(factor: float) -> None:
     text = one(told(lambda i, pair: (pair[0], pair[1] * np.float32(factor))))
     assert text.startswith("the median of the true depth is ") and text.endswith("; UNIT")
     assert ("millimetres read as metres?" in text) == (factor > 1)
+
+
+def with_sky(value: Callable[[int, np.ndarray], float]) -> Callable[[int, Pair], Pair]:
+    """The upper third has one value, made of the frame's number and its depth."""
+
+    def change(index: int, pair: Pair) -> Pair:
+        depth = pair[1].copy()
+        depth[: SIZE[0] // 3] = value(index, depth)
+        return pair[0], depth
+
+    return change
+
+
+def test_one_value_far_beyond_all_others_is_doubted() -> None:
+    text = one(told(with_sky(lambda index, depth: 1000.0)))
+    assert text.startswith("the true depth is 1000 m in many pixels of 12 frames")
+    assert text.endswith("; FAR")
+
+
+@pytest.mark.parametrize(
+    ("value", "farthest"),
+    [
+        (lambda index, depth: 1000.0, 999.0),  # is not scored
+        (lambda index, depth: 1000.0 + index, math.inf),  # is another in each frame
+        (lambda index, depth: float(1.9 * depth.max()), math.inf),
+    ],
+)
+def test_a_far_value_is_believed(
+    value: Callable[[int, np.ndarray], float], farthest: float
+) -> None:
+    assert told(with_sky(value), farthest=farthest) == []
 
 
 def test_the_median_is_over_frames_not_of_a_few_far_pixels() -> None:

@@ -27,11 +27,12 @@ MILLIMETRES = np.array([[0, 1, 1500], [65535, 2000, 3]], np.uint16)
 
 
 @pytest.mark.parametrize("layout", ["16UC1; png compressed", "png", ""])
-def test_png_is_millimetres_and_zero_is_none(layout: str) -> None:
+def test_png_is_millimetres_and_both_ends_are_none(layout: str) -> None:
     depth = message(layout, png(MILLIMETRES))
     assert is_compressed_depth(depth)
-    expected = np.array([[np.nan, 0.001, 1.5], [65.535, 2, 0.003]], np.float32)
+    expected = np.array([[np.nan, 0.001, 1.5], [np.nan, 2, 0.003]], np.float32)
     np.testing.assert_allclose(decode_compressed_depth(depth), expected, rtol=1e-6)
+    assert decode_compressed_depth(depth, full=True)[1, 0] == np.float32(65.535)
 
 
 def test_compressed_depth_of_16uc1_skips_its_header() -> None:

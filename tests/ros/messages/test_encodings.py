@@ -336,12 +336,14 @@ def test_any_header_is_decoded_or_refused(
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_depth_in_millimetres_becomes_metres_and_zero_nan(big: bool) -> None:
-    values = np.array([0, 1, 1500, 65535], ">u2" if big else "<u2")
-    depth = decode_metric_depth(raster(values.tobytes(), 2, 2, "16UC1", 4, big))
+def test_depth_in_millimetres_becomes_metres_and_both_ends_nan(big: bool) -> None:
+    values = np.array([0, 1, 65534, 65535], ">u2" if big else "<u2")
+    stored = raster(values.tobytes(), 2, 2, "16UC1", 4, big)
+    depth = decode_metric_depth(stored)
     assert depth.dtype == np.float32
-    assert np.isnan(depth[0, 0])
-    assert np.allclose(depth.reshape(-1)[1:], [0.001, 1.5, 65.535], rtol=1e-6)
+    expected = [[np.nan, 0.001], [65.534, np.nan]]
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+    assert decode_metric_depth(stored, full=True)[1, 1] == np.float32(65.535)
 
 
 def test_float_depth_keeps_metres_and_only_what_is_in_front() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dyfn_ros.recordings.open import Recording, open_recording
+from dyfn_ros.recordings.topics import is_rectified
 from dyfn_ros.recordings.typestore import CAMERA_INFO, Lens, camera_info
 from dyfn_ros.recordings.writer import RecordingWriter
 from tests.support.numbered import CAMERA, SECOND, SIZE, depth, numbers, picture
@@ -98,3 +99,48 @@ def test_an_unknown_lens_names_the_way_on(
     assert text.endswith("; --camera-info-topic none takes the images as they are")
     without = open_recording(tmp_path / "bag", camera_info_topic="none")
     assert [frame.camera_matrix for frame in without.frames()] == [None] * COUNT
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/image_rect", True),
+        ("/camera/image_rect_color/compressed", True),
+        ("/camera/rectified/image", True),
+        ("/rect_left/image", True),
+        ("/camera/image_raw", False),
+        ("/camera/rectangle/image", False),
+        ("/rectified/camera/image_raw", False),
+        ("/camera/correct_image", False),
+    ],
+)
+def test_what_is_rectified_is_told_by_its_name(topic: str, rectified: bool) -> None:
+    assert is_rectified(topic) == rectified
+
+
+@pytest.mark.parametrize(
+    ("name", "projected", "d", "focal"),
+    [
+        ("image_rect", 30.0, FOUR, 30.0),
+        ("image_rect", 0.0, (), 40.0),  # of a driver that leaves P empty and has no lens
+        ("image_rect", 0.0, FOUR, None),
+        ("image_raw", 30.0, (), 40.0),
+    ],
+)
+def test_a_rectified_image_has_the_intrinsics_of_p(
+    tmp_path: Path, name: str, projected: float, d: tuple[float, ...], focal: float | None
+) -> None:
+    with RecordingWriter(tmp_path / "bag") as writer:
+        info = camera_info(CAMERA, SIZE, SECOND, "camera", Lens("plumb_bob", d))
+        info.p = info.p * np.array([projected / 40, 1, 1, 1, 1, projected / 40, *([1] * 6)])
+        if projected == 0:
+            info.p = np.zeros(12)
+        writer.write("/camera/camera_info", CAMERA_INFO, info, SECOND)
+        writer.write_image(f"/camera/{name}", picture(0), SECOND, "camera")
+    recording = open_recording(tmp_path / "bag")
+    (frame,) = recording.frames()
+    np.testing.assert_array_equal(frame.image, picture(0))
+    assert (frame.camera_matrix is None) == (focal is None)
+    if frame.camera_matrix is not None:
+        assert frame.camera_matrix[0, 0] == frame.camera_matrix[1, 1] == focal
+    assert any("P[0] is 0" in text for text in recording.notes.warnings) == (focal is None)

@@ -1,0 +1,164 @@
+"""Recordings whose files or messages are unusual, in the forms that docs/recordings.md lists.
+
+Each maker takes a folder that is empty and gives the path to open.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import zstandard
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from dyfn_ros.recordings.typestore import IMAGE, TYPES, Lens
+from tests.support.formats_of_bags import (
+    COLOUR,
+    COUNT,
+    Event,
+    Maker,
+    bag,
+    bag1,
+    bare,
+    colours,
+    image,
+    infos,
+    millimetres,
+    of,
+    parts,
+    stamp,
+    truths,
+    whole,
+)
+from tests.support.numbered import depth, picture
+
+BARREL = Lens("plumb_bob", (-0.3, 0.1, 0.0, 0.0, 0.0))
+SKIPPED = struct.pack("<II", 0x184D2A50, 4) + b"what"  # a frame of zstd that holds no data
+
+
+def reversed_list(folder: Path) -> Path:
+    made = parts(folder, (0, 1, 2, 3), True)
+    head, *names = (made / "metadata.yaml").read_text().split("\n  - ")
+    text = "\n  - ".join([head, *(name.strip() for name in reversed(names))])
+    (made / "metadata.yaml").write_text(text)
+    return made
+
+
+def twins(folder: Path) -> Path:
+    made = folder / "walk"
+    made.mkdir()
+    for plugin, suffix in ((StoragePlugin.MCAP, "mcap"), (StoragePlugin.SQLITE3, "db3")):
+        path = next(bag(folder / suffix, whole(), plugin).glob(f"*.{suffix}"))
+        path.rename(made / f"walk.{suffix}")
+    return made
+
+
+def many_frames(folder: Path) -> Path:
+    data = bare(folder).read_bytes()
+    pieces = [data[at : at + 1000] for at in range(0, len(data), 1000)]
+    path = folder / "packed.mcap.zst"
+    path.write_bytes(b"".join(SKIPPED + zstandard.compress(piece) for piece in pieces))
+    return path
+
+
+def broken_link(folder: Path) -> Path:
+    made = bag(folder / "bag", whole())
+    path = next(made.glob("*.mcap"))
+    path.unlink()
+    path.symlink_to(folder / "elsewhere.mcap")
+    return made
+
+
+def gzipped(folder: Path) -> Path:
+    path = folder / "walk.bag.gz"
+    path.write_bytes(gzip.compress(bag1(folder / "walk.bag", whole()).read_bytes()))
+    return path
+
+
+def big_endian_cdr(folder: Path) -> Path:
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for event in whole():
+            key = event.topic, event.kind
+            known = {(c.topic, c.msgtype): c for c in writer.connections}
+            connection = known.get(key) or writer.add_connection(*key, typestore=TYPES)
+            data = TYPES.serialize_cdr(event.message, event.kind, little_endian=False)
+            writer.write(connection, event.log_ns, data)
+    return folder / "bag"
+
+
+def big_endian_pixels() -> list[Event]:
+    events = truths(pixels=lambda i: millimetres(i).byteswap())
+    for event in events:
+        event.message.is_bigendian = 1
+    return [*colours(), *infos(), *events]
+
+
+def rectified() -> list[Event]:
+    """P is that of the images, K and D of those that they were made of."""
+    described = infos(lens=BARREL)
+    for event in described:
+        event.message.k = event.message.k * np.array([2, 1, 1, 1, 2, 1, 1, 1, 1.0])
+    return [*colours("/cam/image_rect_color"), *described, *truths("/cam/depth/image_rect")]
+
+
+def with_top(pixels: Callable[[int], np.ndarray], value: float) -> Callable[[int], np.ndarray]:
+    """A third of the rows have this value."""
+
+    def made(index: int) -> np.ndarray:
+        found = pixels(index).copy()
+        found[:8] = value
+        return found
+
+    return made
+
+
+def padded() -> list[Event]:
+    """Rows that are longer in the file than in the picture."""
+    events = []
+    for index in range(COUNT):
+        wide = cv2.copyMakeBorder(picture(index), 0, 0, 0, 8, cv2.BORDER_CONSTANT)
+        message = image(wide, "rgb8", stamp(index))
+        message.width -= 8
+        events.append(Event(COLOUR, IMAGE, stamp(index), message))
+    return [*events, *truths()]
+
+
+def binned() -> list[Event]:
+    described = infos(size=(48, 64))
+    for event in described:
+        event.message.binning_x = event.message.binning_y = 2
+    return [*colours(), *truths(), *described]
+
+
+def uncalibrated() -> list[Event]:
+    described = infos()
+    for event in described:
+        event.message.k = np.zeros(9)
+    return [*colours(), *truths(), *described]
+
+
+FILES: dict[str, Maker] = {
+    "split, listed in another order": reversed_list,
+    "the same as `.mcap` and `.db3`, no `metadata.yaml`": twins,
+    "`.mcap.zst` of many frames (pzstd)": many_frames,
+    "a link that leads nowhere": broken_link,
+    "`.bag.gz`": gzipped,
+    "CDR, most significant byte first": big_endian_cdr,
+}
+MESSAGES: dict[str, Maker] = {
+    "`image_rect...` with a CameraInfo that has a lens": of(rectified),
+    "65535 in 16UC1": of(
+        lambda: [*colours(), *infos(), *truths(pixels=with_top(millimetres, 65535))]
+    ),
+    "one far value for no depth (1000 m, 65504 m)": of(
+        lambda: [*colours(), *truths(encoding="32FC1", pixels=with_top(depth, 1000))]
+    ),
+    "16UC1, most significant byte first": of(big_endian_pixels),
+    "rows with padding": of(padded),
+    "CameraInfo with binning": of(binned),
+    "CameraInfo with K all 0": of(uncalibrated),
+}
