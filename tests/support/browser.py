@@ -37,6 +37,29 @@ window.addEventListener("load", function () {{
 }});
 </script></body>"""
 
+# Elements that stand out of the window, and the widths of the page and of the window.
+FITS = """
+  var all = Array.from(document.querySelectorAll("body *"));
+  var wide = all.filter(function (one) {
+    var box = one.getBoundingClientRect();
+    return box.width > 0 && box.right > window.innerWidth + 1 && !one.closest("svg");
+  });
+  var words = Array.from(document.querySelectorAll("th")).filter(function (one) {
+    return one.scrollWidth > one.clientWidth;
+  });
+  var root = document.documentElement;
+  var fit = { wide: wide.map(function (one) { return one.tagName + " " + one.className; }),
+    words: words.map(function (one) { return one.textContent; }),
+    page: root.scrollWidth, window: root.clientWidth };
+"""
+
+
+def assert_fits(seen: dict[str, Any]) -> None:
+    """What FITS found of a page: nothing has to be scrolled sideways, at any width."""
+    for width, fit in seen.items():
+        assert fit.get("wide") == fit.get("words") == [], (width, fit)
+        assert fit["page"] <= fit["window"] == int(width)
+
 
 def look(page: Path, widths: Sequence[int], body: str, folder: Path) -> dict[str, Any]:
     """Open a page in windows of these widths; skips where there is no browser.

@@ -195,7 +195,7 @@ def _sections(results: dict[str, Any], table: Table) -> list[Section]:
     variants = [
         Variant(n, role(n), {**scores, "frames": int(length)}) for n, scores in names.items()
     ]
-    lead = Text(f"Over {length} frames under one alignment: {headline(variants)}", lead=True)
+    lead = Text(f"Under one alignment for all frames: {headline(variants)}", lead=True)
     return [
         Section("At a glance", [lead, key_figures(variants)]),
         *data_sections(results),
@@ -210,15 +210,18 @@ def _curves(results: dict[str, Any]) -> list[Part]:
     names = list(dict.fromkeys(name for point in found.values() for name in point["variants"]))
     muted = {name for name in names if role(name) == "control"}
 
-    def curve(metric: str, unit: str) -> Part:
+    def curve(metric: str, label: str, unit: str) -> Part:
         lines = {
             name: [_score(point["variants"].get(name), metric) for point in found.values()]
             for name in names
         }
-        title = f"{metric}, one alignment for all frames (video)"
+        title = f"{label}, one alignment for all frames (video)"
         return Curves(title, lines, "frames that share one alignment", unit, lengths, muted)
 
-    return [curve("abs_rel", "AbsRel (share of the true depth)"), curve("delta1", "share")]
+    return [
+        curve("abs_rel", "AbsRel", "share of the true depth"),
+        curve("delta1", "delta1", "share"),
+    ]
 
 
 def _score(point: Point | None, metric: str) -> float | None:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 WIDTH, HEIGHT = 860, 236
-LEFT, RIGHT, TOP, BOTTOM = 66, 850, 24, 196
+LEFT, RIGHT, TOP, BOTTOM = 66, 850, 30, 196
 BUCKETS = 400  # of a long curve; each keeps its lowest and its highest value
 BARS = 40
 COLOURS = 6
@@ -154,9 +154,10 @@ def histogram_html(part: Histogram) -> str:
         )
         for label, place in part.marks.get(name, {}).items():
             x = _x(min(place, high), low, high)
+            beside = f'x="{x + 3:.1f}"' if x < RIGHT - 40 else f'x="{x - 3:.1f}" text-anchor="end"'
             drawn.append(
                 f'<line x1="{x}" x2="{x}" y1="{TOP}" y2="{BOTTOM}" stroke="{colour}" '
-                f'stroke-dasharray="4 3"/><text x="{x + 3:.1f}" y="{TOP + 11 + 13 * number}">'
+                f'stroke-dasharray="4 3"/><text {beside} y="{TOP + 11 + 13 * number}">'
                 f"{escape(label)}</text>"
             )
     return (

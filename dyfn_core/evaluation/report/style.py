@@ -25,8 +25,9 @@ tbody tr:last-child td { border-bottom: 0; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 tr.muted td { color: var(--soft); }
 table.wide { font-size: .8rem; width: 100%; } table.wide th, table.wide td { padding: .2rem .3rem; }
-table.narrow td, table.wide td { overflow-wrap: normal; }
-table.narrow td:first-child, table.wide td:first-child, td:last-child { overflow-wrap: anywhere; }
+table.narrow :is(th, td), table.wide td { overflow-wrap: normal; }
+table.narrow :is(th, td):first-child, table.wide td:first-child, td:last-child {
+  overflow-wrap: anywhere; }
 img { max-width: 100%; height: auto; display: block; margin: .5rem 0; border-radius: 6px; }
 .figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(10.5rem, 1fr));
   gap: .8rem; }
@@ -38,7 +39,8 @@ img { max-width: 100%; height: auto; display: block; margin: .5rem 0; border-rad
 .figures small { display: block; color: var(--soft); font-size: .8rem; line-height: 1.35; }
 .figures span small { display: inline; }
 figure { margin: .6rem 0 1rem; position: relative; } figcaption { font-weight: 600; }
-.legend { font-size: .85rem; color: var(--soft); } .legend span { margin-right: 1.1em; }
+.legend { font-size: .85rem; color: var(--soft); } .legend span { margin-right: 1.1em;
+  display: inline-block; }
 .legend svg { display: inline-block; width: 32px; height: 4px; vertical-align: middle;
   margin-right: .35em; }
 svg { width: 100%; height: auto; display: block; } svg text { fill: var(--soft); font-size: 11px; }

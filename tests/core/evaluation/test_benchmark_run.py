@@ -312,7 +312,7 @@ def test_long_from_the_command_line(tmp_path: Path) -> None:
     picture = cv2.imread(str(tmp_path / "out" / "lengths.png"))
     assert picture is not None and picture.std() > 5
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Over 9 frames under one alignment: The scale of drift wanders by" in page
+    assert "Under one alignment for all frames: The scale of drift wanders by" in page
     assert "Error against length" in page and "Implausible" not in page
     assert read(tmp_path / "out")["warnings"] == []
 

@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dyfn_core.cli import eval as cli
 from dyfn_core.evaluation.report.cloud_view import CloudView, PointCloud
 from dyfn_core.evaluation.report.html import Section, Table, write_report
 from dyfn_core.evaluation.report.sequence import sequence_sections
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.geometry.registration import Similarity
-from tests.support.browser import look
+from tests.support.browser import FITS, assert_fits, look
+from tests.support.made_benchmarks import depth, make_tum
 
 pytestmark = pytest.mark.slow
 
 WIDTHS = (1280, 500)
-SEEN = """
-  var wide = Array.from(document.querySelectorAll("body *")).filter(function (one) {
-    var box = one.getBoundingClientRect();
-    return box.width > 0 && box.right > window.innerWidth + 1 && !one.closest("svg");
-  });
+SEEN = (
+    FITS
+    + """
   var canvas = document.querySelector("canvas"), gl = canvas.getContext("webgl");
   var box = document.querySelector("input");
   function share() {
@@ -40,10 +40,10 @@ SEEN = """
     canvas.dispatchEvent(new window.KeyboardEvent("keydown", { key: "ArrowLeft" }));
   var turned = share();
   document.querySelectorAll("button")[1].click();
-  return { first: first, turned: turned, other: share(),
-    wide: wide.map(function (one) { return one.tagName + " " + one.className; }),
+  return { first: first, turned: turned, other: share(), fit: fit,
     drawn: document.querySelector(".cloud").classList.contains("live") };
 """
+)
 
 
 def drifting(count: int, drift: float) -> SequenceEvaluation:
@@ -79,10 +79,26 @@ def test_a_report_fits_and_its_cloud_turns(tmp_path: Path) -> None:
     facts = Table(("", ""), [["output", "a/" * 80], ["hash", "0" * 64]])
     write_report(tmp_path / "r.html", "t", [*sections, Section("More", [many, few, facts])])
     assert (tmp_path / "r.html").stat().st_size < 700_000
-    for width, seen in look(tmp_path / "r.html", WIDTHS, SEEN, tmp_path).items():
-        assert seen.get("wide") == [], (width, seen)
+    shown = look(tmp_path / "r.html", WIDTHS, SEEN, tmp_path)
+    assert_fits({width: seen.get("fit", seen) for width, seen in shown.items()})
+    for seen in shown.values():
         assert seen["drawn"]
         (red, blue), (turned, _), (gone, other) = seen["first"], seen["turned"], seen["other"]
         assert red > 0.05 and blue == 0
         assert turned < 0.7 * red  # from the side the wall is narrow
         assert gone == 0 and other == pytest.approx(turned, rel=0.05)
+
+
+@pytest.mark.parametrize(("command", "more"), [("score", []), ("long", ["--lengths", "3", "8"])])
+def test_reports_of_dyfn_eval_fit(tmp_path: Path, command: str, more: list[str]) -> None:
+    sequence = "rgbd_dataset_freiburg1_made"
+    make_tum(tmp_path / "root" / sequence, 8)
+    predictions = tmp_path / "a method with a long name"
+    predictions.mkdir()
+    drifting = [depth(i, (24, 32)) * (1 + 0.1 * i) for i in range(8)]
+    np.save(predictions / f"{sequence}.npy", np.stack(drifting))
+    arguments = [command, "--benchmark", "tum", "--root", str(tmp_path / "root"), *more]
+    arguments += ["--predictions", str(predictions), "--quantity", "depth"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "out")]) == 0
+    page = tmp_path / "out" / "report.html"
+    assert_fits(look(page, WIDTHS, f"{FITS} return fit;", tmp_path))
