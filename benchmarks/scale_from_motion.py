@@ -1,6 +1,6 @@
 """Scale from the camera's own motion, with its parts added one by one, on recordings with poses.
 
-    python benchmarks/scale_from_motion.py SOURCE... [--every N] [--seeds 0 1] [--whole]
+    python benchmarks/scale_from_motion.py SOURCE... [--every N] [--seeds 0 1] [--whole] [--stops 8]
 
 SOURCE is an RGB-D folder with intrinsics, depth and poses (poses.txt), a bag with depth and the
 topics of bags/demo, or the folder of a rendered clip (dyfn-worlds). The network runs once per
@@ -13,6 +13,8 @@ frame with DyFN and once without; every row then corrects the same predictions:
     + all, shift   the filtered shift under all of it
     base + memory  the same without DyFN
 --whole prints DyFN and + memory alone, and how much worse than DyFN the worst row is.
+--stops S... prints another table: + memory with noisy odometry that stops after S seconds, the
+metric AbsRel before and after, beside that of an odometry that goes on.
 "true" poses are those of the recording, "robot's" those of its odometry topic, "noisy" ones have
 the errors of OdometryNoise, one row per seed; "bad" ones are 5% too long, with random walks of 3%
 and 1 degree, and say nothing of it. image and video align each frame, or all frames, by a scale
@@ -41,6 +43,7 @@ from dyfn_core.scoring.protocols import SequenceScore, SequenceScorer
 DEPTH_MAX = 10.0  # metres, of the truth
 BAD = OdometryNoise(0.05, 0.03, 1.0)
 HEAD = "| | | odometry | image | video | metric | in metres | to DyFN | CPU ms |"
+STOPS = "| | odometry stops at | seed | before | after: goes on | stops | to before | to goes on |"
 
 
 class Corrector:
@@ -206,11 +209,37 @@ def odometries(frames: Sequence[Predicted], seeds: Sequence[int]) -> dict[str, l
     }
 
 
+def stopped(name: str, frames: Sequence[Predicted], seconds: Sequence[float], seed: int) -> None:
+    """Print what the metres are worth after the odometry has stopped."""
+    first = frames[0].frame.stamp
+    true = [frame.frame.pose for frame in frames]
+    poses = noisy_poses(true, OdometryNoise(seed=seed))
+    for stop in seconds:
+        scores = []
+        for goes_on in (True, False):
+            before, after = Row(name, "", ""), Row(name, "", "")
+            corrector = Corrector(WHOLE)
+            for one, pose in zip(frames, poses, strict=True):
+                late = one.frame.stamp - first >= stop
+                frame = replace(one.frame, pose=pose if goes_on or not late else None)
+                relative, metres = corrector.push(frame)
+                (after if late else before).push(relative, metres, one.truth)
+            scores += [part.metric.metric() for part in (before, after)]
+        known, on, _, off = (math.nan if s is None else s.metrics["abs_rel"] for s in scores)
+        ratios = f"{off / known:.2f} | {off / on:.2f}"
+        cells = " | ".join(f"{value:.3f}".removeprefix("0") for value in (known, on, off))
+        print(f"| {name} | {stop:g} s | {seed} | {cells} | {ratios} |", flush=True)
+
+
 def report(source: Path, options: argparse.Namespace) -> tuple[float, str]:
     """Print the rows of a recording; video AbsRel against DyFN of the worst row of + memory."""
     name, worst = source.name, (-math.inf, "")
     with torch.inference_mode():
         frames = list(predicted(source, options.model, options.every, options.max_frames))
+    if options.stops:
+        for seed in options.seeds:
+            stopped(name, frames, options.stops, seed)
+        return worst
     rows = plain(name, frames)
     dyfn = rows[1].video
     for row in rows[1:] if options.whole else rows:
@@ -233,7 +262,13 @@ def main() -> None:
     parser.add_argument("--max-frames", type=int, default=None)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0], help="of the odometry's noise")
     parser.add_argument("--whole", action="store_true", help="only DyFN and + memory")
+    parser.add_argument("--stops", type=float, nargs="*", default=[], help="seconds, of odometry")
     options = parser.parse_args()
+    if options.stops:
+        print(STOPS, "| --- " * 8 + "|", sep="\n")
+        for source in options.sources:
+            report(source, options)
+        return
     print(HEAD, "| --- " * 9 + "|", sep="\n")
     share, where = max(report(source, options) for source in options.sources)
     print(f"\nWorst against DyFN: {100 * share:+.1f}% ({where}).")

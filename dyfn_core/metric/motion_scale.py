@@ -38,6 +38,7 @@ from dyfn_core.metric.scale_filter import (
     restarted,
     update,
 )
+from dyfn_core.threads import one_blas_thread
 
 _DOUBT = 1.5  # factor on a point's sigma: points of one frame err alike
 _SHAPE = 0.11  # standard deviation of log depth that the field leaves to the prediction
@@ -187,7 +188,7 @@ class MotionScale:
 def step(
     state: MotionScaleState, frame: MotionFrame, options: MotionScaleOptions
 ) -> tuple[MotionScaleState, MotionScale]:
-    """Take the next frame of a stream.
+    """Take the next frame of a stream, on one thread of numpy's.
 
     Args:
         state: after the frame before, MotionScaleState() for the first; it is not changed.
@@ -202,6 +203,13 @@ def step(
             camera's, the pose is not 4 x 4, or the stamp is not finite.
     """
     _check(frame)
+    with one_blas_thread():
+        return _step(state, frame, options)
+
+
+def _step(
+    state: MotionScaleState, frame: MotionFrame, options: MotionScaleOptions
+) -> tuple[MotionScaleState, MotionScale]:
     motion, points = _seen(state.motion, frame, options)
     elapsed = 0.0 if state.stamp is None else max(frame.stamp - state.stamp, 0.0)
     state = replace(_doubted(state, points, elapsed, options), motion=motion, stamp=frame.stamp)

@@ -14,6 +14,7 @@ import numpy as np
 from dyfn_core.geometry.key_points import KeyPoints, find_key_points, matched
 from dyfn_core.geometry.resection import resect
 from dyfn_core.metric.motion import weighted_median
+from dyfn_core.threads import one_blas_thread
 
 _CELLS = (6, 8)  # rows and columns of the grid that a measurement is evened out over
 _LEVELS = 5  # pictures kept, numbers that are multiples of 1, 2, 4, ...
@@ -149,8 +150,9 @@ def step(
         return _remembered(state, seen, 0, options), ScaleMemoryFound()
     latest = state.kept[0][1] if state.kept else None
     accounts, shared = [], 0
-    for reference in state.references:
-        change = scale_change(reference, seen, options)
+    with one_blas_thread():
+        changes = [scale_change(reference, seen, options) for reference in state.references]
+    for reference, change in zip(state.references, changes, strict=True):
         if change is not None:
             corrected = reference.correction - change.log_ratio
             accounts.append((corrected, 1 / (change.variance + reference.variance), change.points))
