@@ -350,6 +350,10 @@ class StreamDepthNode(LifecycleNode):
             except StateError as error:
                 response.success = False
                 lines.append(f"{title}{error}")
+            except Exception as error:  # which nobody foresaw; the client waits for an answer
+                self.callback_failed(error)
+                response.success = False
+                lines.append(f"{title}{type(error).__name__}: {error}")
         response.message = "; ".join(lines)
         logger = self.get_logger()
         if response.success:

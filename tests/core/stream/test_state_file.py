@@ -217,6 +217,11 @@ def test_a_missing_folder_is_named(small_moge: MoGeModel, tmp_path: Path) -> Non
         save_stream(tmp_path / "no" / "s", played(small_moge, 1), "m")
 
 
+def test_a_name_that_is_too_long_is_said(small_moge: MoGeModel, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot be written: File name too long"):
+        save_stream(tmp_path / ("n" * 300), played(small_moge, 1), "m")
+
+
 @settings(max_examples=80, deadline=None)
 @given(
     st.recursive(

@@ -21,7 +21,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CompressedImage, Image
 from torch import Tensor
 
-from dyfn_core.models.base import Latent
+from dyfn_core.models import load_model
+from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_ros.messages.images import decode_depth
 from dyfn_ros.node.log_throttle import Throttle
@@ -32,6 +33,7 @@ from tests.support.probe import Probe, stamp_of, stamped
 from tests.support.ros_graph import image_message
 
 SIZE = (48, 64)
+KNOWN = "known"  # name of the model whose right depth is known
 FRAME = "optical"  # frame_id of the pictures
 FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
 PATIENCE = 20.0  # seconds that anything may take on a busy machine
@@ -229,6 +231,7 @@ def faulty_bench(
     """A node with such cameras and the client, which have seen each other."""
     gc.collect()  # rcl keeps a node while Python does, and the next of its name has no /rosout
     values: dict[str, Any] = {
+        "model": KNOWN,
         "cameras": f"[{', '.join(cameras)}]",
         "device": "cpu",
         "threads": 1,
@@ -251,7 +254,9 @@ def faulty_bench(
         probe.close()
 
 
-def _load(name: str, device: str) -> FaultyPinhole:
+def _load(name: str, device: str) -> GeometryModel:
+    if name != KNOWN:
+        return load_model(name, device)
     model = FaultyPinhole()
     # The identity, whatever it remembers: the right depth stays known.
     model.stabilizer = build_dyfn(3, DyFNConfig(hidden=4, form="residual"))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.support.faults import pictures, requests
+from tests.support.faults import models, pictures, requests, state_files
 from tests.support.faults.bench import Bench, faulty_bench
 from tests.support.faults.fault import Fault, Row, run
 from tests.support.ros_graph import own_domain
@@ -33,6 +35,8 @@ class Kind:
 KINDS = (
     Kind("Pictures", pictures.FAULTS),
     Kind("Requests", requests.FAULTS),
+    Kind("State files", state_files.FAULTS, state_files.state_bench),
+    Kind("Models and devices", models.FAULTS, models.model_bench),
 )
 
 
@@ -56,11 +60,17 @@ def table(kinds: dict[str, list[Row]]) -> str:
 
 
 def _line(row: Row) -> str:
-    said = [f"`{text}`" for text in row.said]
+    said = [f"`{shown(text)}`" for text in row.said]
     came = "; ".join([row.gave, *said])
     pictures = f"{row.frames} picture{'s' * (row.frames > 1)}, {row.seconds:.2f} s"
     cells = (row.name, row.result, came, pictures)
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def shown(text: str) -> str:
+    """Without folders of this machine and names of hundreds of characters."""
+    text = re.sub(rf"{re.escape(tempfile.gettempdir())}/\w+", "FOLDER", text)
+    return re.sub(r"(.)\1{30,}", r"\1\1\1...", text)
 
 
 def updated(text: str, kinds: dict[str, list[Row]]) -> str:
