@@ -9,8 +9,12 @@ Nothing here is differentiated through.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
+
+from dyfn_core.geometry.anchor_bounds import AnchorBounds
 
 __all__ = [
     "align_points",
@@ -22,7 +26,8 @@ __all__ = [
 ]
 
 SHIFTS = ("none", "z", "xyz")
-_CHUNK = 1 << 22  # terms of the objective that are worked on at a time
+PROBES = 2  # samples that are tried before the others, to rule these out
+_CHUNK = 1 << 15  # terms of the objective that are worked on at a time
 
 
 @torch.no_grad()
@@ -94,38 +99,80 @@ def align_points(
 
     shift: "none" (all zero), "z" (of the last axis alone) or "xyz" (of every axis).
     anchors: B x A indices of the samples that the fit may pass through along the shifted axes;
-        None tries all of them, which costs N^2 log N.
+        None tries all of them, but for those that cannot be the best (anchor_bounds).
     Without anchors, "none" and "z" are exact. "xyz" is the best of the fits through one sample
     along all axes at once, as MoGe solves it; align_points_exact knows no such limit.
     Where nothing has weight, scale and shift are 0. Raises ValueError for another shift.
     """
     shifted = _shifted_axes(shift, points)
-    batch, count, dims = points.shape
+    batch, _, dims = points.shape
     if shift == "none":
         weights = weight.repeat_interleave(dims, dim=-1)
         scale, _ = align_scale(points.flatten(-2), target.flatten(-2), weights, trunc)
         return scale, points.new_zeros(batch, dims)
     if anchors is None:
         points, target, weight = _weighted_first(points, target, weight)
-        count = weight.shape[1]
-        anchors = torch.arange(count, device=points.device).expand(batch, -1)
-    index = anchors[..., None].expand(-1, -1, dims)
-    from_points = points.gather(1, index) * shifted
-    from_target = target.gather(1, index) * shifted
-    per_chunk = max(1, _CHUNK // max(1, batch * count * dims))
-    found = [
-        _through(points, target, weight, trunc, start_points, start_target)
-        for start_points, start_target in zip(
-            from_points.split(per_chunk, 1), from_target.split(per_chunk, 1), strict=True
-        )
-    ]
-    scales, errors = (torch.cat(part, 1) for part in zip(*found, strict=True))
-    usable = weight.gather(1, anchors) > 0
-    best = torch.where(usable, errors, torch.inf).argmin(dim=1)
-    rows = torch.arange(batch, device=points.device)
-    scale = torch.where(usable.any(1), scales[rows, best], 0.0)
-    moved = from_target[rows, best] - scale[:, None] * from_points[rows, best]
-    return scale, torch.where(usable.any(1)[:, None], moved, 0.0)
+    problem = _Problem(points, target, weight, shifted, trunc)
+    if anchors is None and trunc is not None and weight.shape[1] > PROBES:
+        row, anchor = _worth_trying(problem, trunc)
+    elif anchors is None:
+        row, anchor = torch.nonzero(weight > 0, as_tuple=True)
+    else:
+        row = torch.arange(batch, device=points.device).repeat_interleave(anchors.shape[1])
+        anchor = anchors.flatten()
+        row, anchor = (part[weight[row, anchor] > 0] for part in (row, anchor))
+    return _best(problem, row, anchor)[:2]
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Points and target B x N x D, weight B x N, the shifted axes, D bool, and trunc."""
+
+    points: Tensor
+    target: Tensor
+    weight: Tensor
+    shifted: Tensor
+    trunc: float | None
+
+
+def _worth_trying(problem: _Problem, trunc: float) -> tuple[Tensor, Tensor]:
+    """The entries and anchors that the best fits may pass through.
+
+    The fits through a few samples bound the error of the best one.
+    """
+    count = (problem.weight > 0).sum(1)
+    steps = (torch.arange(PROBES, device=count.device) + 0.5) / PROBES
+    spread = (steps * count[:, None]).long()
+    rows = torch.arange(len(count), device=count.device).repeat_interleave(PROBES)
+    scale, _, _ = _best(problem, *_weighted(problem, rows, spread.flatten()))
+    bounds = AnchorBounds(problem.points, problem.target, problem.weight, problem.shifted, trunc)
+    near = bounds.errors_at(scale).topk(PROBES, largest=False).indices
+    scale, _, error = _best(problem, *_weighted(problem, rows, near.flatten()))
+    row, anchor = torch.nonzero(bounds.left(scale, error), as_tuple=True)
+    return row, anchor
+
+
+def _weighted(problem: _Problem, row: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
+    """Those of the anchors that have a weight."""
+    counts = problem.weight[row, anchor] > 0
+    return row[counts], anchor[counts]
+
+
+def _best(problem: _Problem, row: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The best of the fits through P samples `anchor` of entries `row`: scale B, shift B x D and
+    error B; 0, 0 and infinity in entries without one."""
+    batch, count, dims = problem.points.shape
+    per_chunk = max(1, _CHUNK // max(1, count * dims))
+    errors = problem.points.new_full((batch, count), torch.inf)
+    scales = problem.points.new_zeros(batch, count)
+    for pair in zip(row.split(per_chunk), anchor.split(per_chunk), strict=True):
+        scales[pair], errors[pair] = _through(problem, *pair)
+    error, best = errors.min(1)
+    rows = torch.arange(batch, device=best.device)
+    scale = scales[rows, best]
+    shift = problem.target[rows, best] - scale[:, None] * problem.points[rows, best]
+    shift = torch.where(torch.isfinite(error)[:, None] & problem.shifted, shift, 0.0)
+    return scale, shift, error
 
 
 def _weighted_first(
@@ -147,19 +194,14 @@ def _shifted_axes(shift: str, points: Tensor) -> Tensor:
     return axes
 
 
-def _through(
-    points: Tensor,
-    target: Tensor,
-    weight: Tensor,
-    trunc: float | None,
-    from_points: Tensor,
-    from_target: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """The best scale, and its error, of the fit through each anchor (B x A x D): B x A each."""
-    x = (points[:, None] - from_points[:, :, None]).flatten(-2)
-    y = (target[:, None] - from_target[:, :, None]).flatten(-2)
-    weights = weight.repeat_interleave(points.shape[-1], dim=-1)[:, None].expand_as(x)
-    return align_scale(x, y, weights, trunc)
+def _through(problem: _Problem, row: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
+    """The best scale, and its error, of the fit through each of P anchors: P each."""
+    x, y = (
+        values[row] - (values[row, anchor] * problem.shifted)[:, None]
+        for values in (problem.points, problem.target)
+    )
+    weights = problem.weight[row].repeat_interleave(x.shape[-1], dim=-1)
+    return align_scale(x.flatten(1), y.flatten(1), weights, problem.trunc)
 
 
 def align_points_shift(
