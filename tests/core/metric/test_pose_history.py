@@ -229,10 +229,12 @@ def test_the_caller_may_write_to_what_it_gave_and_got() -> None:
 
 
 def test_poses_may_come_from_another_thread() -> None:
-    history, found = PoseHistory(), []
+    history, found, read = PoseHistory(), [], threading.Event()
 
     def write() -> None:
         for step in range(3000):
+            if step == 1500:
+                read.wait(30)  # on a busy machine the reader may come late
             history.add(ns(0.01 * step), along(0.01 * step))
 
     thread = threading.Thread(target=write)
@@ -241,6 +243,7 @@ def test_poses_may_come_from_another_thread() -> None:
         newest = history.newest
         if newest is not None and newest > START:
             found.append((history.at(newest - 5_000_000), newest))
+            read.set()
     thread.join()
     assert found
     for pose, newest in found:
