@@ -8,6 +8,9 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
+# In which library a model runs; auto is the fastest that is installed.
+BACKENDS = ("torch", "auto", "onnxruntime", "openvino", "tensorrt", "compile")
+
 _Number = TypeVar("_Number", int, float)
 
 

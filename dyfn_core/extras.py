@@ -13,6 +13,7 @@ MODULES = {
     "rerun": ("rerun",),
     "app": ("gradio",),
     "onnx": ("onnx", "onnxruntime"),
+    "openvino": ("openvino",),
     "foxglove": ("mcap_protobuf",),
     "ray": ("ray",),
 }

@@ -164,6 +164,7 @@ class GeometryModel(nn.Module, ABC):
     quantity: "depth" (decode gives AffinePoints, or AffineDepth without a shift), "affine_depth"
         (AffineDepth) or "disparity" (AffineDisparity).
     has_normals: whether decode_all gives normals.
+    backend: the library that runs the network.
     knows_metres: "" for no; "camera" when it needs the focal lengths for them; else "always".
     stabilizer_pool: the pooling that suits a new stabilizer on this latent.
     token_cell: pixels along the side of one token of num_tokens.
@@ -177,6 +178,7 @@ class GeometryModel(nn.Module, ABC):
     has_normals: bool = False
     knows_metres: str = ""
     preparation: str = "none"
+    backend: str = "torch"
     # No class-level None here: it would hide the registered submodule.
     stabilizer: DyFN | None
 
@@ -244,7 +246,22 @@ class GeometryModel(nn.Module, ABC):
     ) -> tuple[Latent, StreamState | None]:
         """One streaming step on a latent; what inference does between encode and decode."""
         features, state = self.stabilize(latent.features, state)
-        return replace(latent, features=features), state
+        size = self.stabilized_size(latent.network_size)
+        return replace(latent, features=features, network_size=size), state
+
+    def stabilized_size(self, network_size: tuple[int, int]) -> tuple[int, int]:
+        """The size (H, W) that a stabilized latent is decoded at, for that of the plain one."""
+        return network_size
+
+    def metres_of_focal(self, network_size: tuple[int, int]) -> tuple[float, float] | None:
+        """See AffineDepth, for a network's image of (H, W); None for models that give no such."""
+        del network_size
+        return None
+
+    @property
+    def plain(self) -> GeometryModel:
+        """The model in torch; itself, unless another library runs it."""
+        return self
 
     @property
     def device(self) -> torch.device:

@@ -31,6 +31,8 @@ from dyfn_core.models.formats import CheckpointError as CheckpointError
 from dyfn_core.models.formats import read_checkpoint as read_checkpoint
 from dyfn_core.models.hub_files import WEIGHTS, Asked, is_hub_id, locate
 from dyfn_core.models.hub_files import model_folder as model_folder
+from dyfn_core.models.identity import full_config as full_config
+from dyfn_core.models.identity import model_fingerprint as model_fingerprint
 from dyfn_core.models.mini import MiniModel
 from dyfn_core.models.moge import MoGeModel
 from dyfn_core.models.moge2 import MoGe2Model
@@ -61,13 +63,17 @@ OFFICIAL_STABILIZER = "head.stabilizer."
 FORMAT = "dyfn"
 
 
-def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> GeometryModel:
+def load_model(
+    name_or_path: str | Path, device: torch.device | str = "cpu", backend: str = "torch"
+) -> GeometryModel:
     """A trained model, in eval mode, float32.
 
     Args:
         name_or_path: "dyfn-mini" (bundled), a file, a folder with a model.safetensors, or a Hub
             id such as "shawlyu/DyFN" or "Ruicheng/moge-vitl", optionally with "/file".
         device: a torch device or its name; "auto" takes a GPU if there is one.
+        backend: the library that runs the network: "torch", "onnxruntime", "openvino", "tensorrt",
+            "compile"; "auto" takes the fastest that is installed (docs/models.md).
 
     Returns:
         The model. `model.stabilizer` is its DyFN module, None for a plain base model.
@@ -77,22 +83,28 @@ def load_model(name_or_path: str | Path, device: torch.device | str = "cpu") -> 
             put it.
         CheckpointError: no checkpoint, or keys that do not fit, all listed; a bundled file with
             other bytes than it was released with; weights that are not finite.
-        ValueError: no such device.
+        ValueError: no such device or backend, or one that is not installed.
 
     Example:
         >>> model = load_model("dyfn-mini")
         >>> model.quantity, model.stabilizer is not None
         ('depth', True)
     """
-    name, device = os.fspath(name_or_path), resolve_device(device)
+    from dyfn_core.models.export.backends import on_backend
+
+    device = resolve_device(device)
+    return on_backend(_read_model(os.fspath(name_or_path)).to(device), backend)
+
+
+def _read_model(name: str) -> GeometryModel:
     if name in BUNDLED and not Path(name).exists():
         with as_file(files("dyfn_core") / "weights" / BUNDLED[name]) as path:
             if not path.exists():
                 raise FileNotFoundError(f"the bundled model {name!r} is not installed: no {path}")
             _check_digest(path, BUNDLED_SHA256[BUNDLED[name]])
-            return build_model(read_checkpoint(path), str(path)).to(device)
+            return build_model(read_checkpoint(path), str(path))
     path = find_checkpoint(name)
-    return build_model(read_checkpoint(path), str(path)).to(device)
+    return build_model(read_checkpoint(path), str(path))
 
 
 def _check_digest(path: Path, expected: str) -> None:
@@ -130,21 +142,6 @@ def empty_model(config: Mapping[str, Any], source: str = "config") -> GeometryMo
     except (TypeError, ValueError) as error:
         raise CheckpointError(f"{source}: bad model config: {error}") from error
     return model
-
-
-def full_config(model: GeometryModel) -> dict[str, Any]:
-    """The config of a model with its stabilizer; empty_model's input."""
-    stabilizer = None if model.stabilizer is None else model.stabilizer.config.to_dict()
-    return {**model.config, "stabilizer": stabilizer}
-
-
-def model_fingerprint(model: GeometryModel) -> str:
-    """SHA-256 of a model's configuration and weights; a different one is a different model."""
-    digest = hashlib.sha256(json.dumps(full_config(model), sort_keys=True).encode())
-    for name, value in sorted(model.state_dict().items()):
-        digest.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 def load_weights(
@@ -199,6 +196,7 @@ def save_model(
             as they are.
         notes: Further metadata, string to string; "format" and "config" are taken.
     """
+    model = model.plain
     weights = {
         key: value.detach().to("cpu", dtype if value.is_floating_point() else None).contiguous()
         for key, value in model.state_dict().items()

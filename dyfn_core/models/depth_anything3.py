@@ -6,7 +6,6 @@ camera whose focal length is 300 pixels of the network's image, from which metre
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -157,8 +156,12 @@ class DepthAnything3Model(GeometryModel):
             [_with_far_sky(z, s) for z, s in zip(logit.float().exp(), sky.float(), strict=True)]
         )
         depth, mask = resized(depth, latent.image_size), SKY - resized(sky, latent.image_size)
-        metres = (size[1] / (2 * FOCAL), size[0] / (2 * FOCAL)) if self.knows_metres else None
-        return AffineDepth(depth[:, 0], mask[:, 0].float(), metres)
+        return AffineDepth(depth[:, 0], mask[:, 0].float(), self.metres_of_focal(size))
+
+    def metres_of_focal(self, network_size: tuple[int, int]) -> tuple[float, float] | None:
+        """See GeometryModel."""
+        height, width = network_size
+        return (width / (2 * FOCAL), height / (2 * FOCAL)) if self.knows_metres else None
 
 
 def _with_far_sky(depth: Tensor, sky: Tensor) -> Tensor:
@@ -167,13 +170,15 @@ def _with_far_sky(depth: Tensor, sky: Tensor) -> Tensor:
     The official code takes one for all images of a batch, and draws pixels of large ones.
     """
     is_sky = sky >= SKY
-    rest = depth[~is_sky]
-    if rest.numel() <= FEWEST or depth.numel() - rest.numel() <= FEWEST:
-        return depth
-    place = SKY_QUANTILE * (rest.numel() - 1)
-    lower = math.floor(place)
-    ordered = rest.detach().sort().values[lower : lower + 2]
-    return torch.where(is_sky, torch.lerp(ordered[0], ordered[-1], place - lower), depth)
+    rest = depth.numel() - is_sky.sum()
+    ordered = torch.where(is_sky, torch.inf, depth).detach().flatten().sort().values
+    place = SKY_QUANTILE * (rest - 1).clamp(min=0).double()
+    lower = place.floor().long()
+    upper = torch.minimum(lower + 1, (rest - 1).clamp(min=0))
+    weight = (place - lower).to(depth.dtype)
+    far = torch.lerp(ordered[lower], ordered[upper], weight)
+    enough = (rest > FEWEST) & (depth.numel() - rest > FEWEST)  # no branch: an export has none
+    return torch.where(is_sky & enough, far, depth)
 
 
 def official_kind(names: Iterable[str]) -> str | None:

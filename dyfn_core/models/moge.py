@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from itertools import pairwise
 from typing import Any
 
@@ -22,7 +22,6 @@ from dyfn_core.models.base import (
 )
 from dyfn_core.models.deterministic import DeterministicConv2d, DeterministicGroupNorm, resize
 from dyfn_core.models.dinov2 import PATCH, SIZES, DinoV2
-from dyfn_core.prediction import StreamState
 
 REMAPS = ("linear", "sinh", "exp", "sinh_exp")
 NORMS = ("group_norm", "layer_norm")
@@ -231,12 +230,9 @@ class MoGeModel(GeometryModel):
         layers = self.backbone(prepared.pixels, self.architecture.intermediate_layers)
         return Latent(self.head.fuse(layers), prepared.image_size, prepared.network_size)
 
-    def stabilize_latent(
-        self, latent: Latent, state: StreamState | None
-    ) -> tuple[Latent, StreamState | None]:
+    def stabilized_size(self, network_size: tuple[int, int]) -> tuple[int, int]:
         """As released: a stabilized frame is decoded at whole patches, the base is not."""
-        latent, state = super().stabilize_latent(latent, state)
-        return replace(latent, network_size=whole_patches(latent.network_size)), state
+        return whole_patches(network_size)
 
     def decode(self, latent: Latent) -> AffinePoints:
         """Latent -> points and mask at the image's size."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -33,13 +34,16 @@ NEXT = "next_"  # before the names of the state that comes out
 STATE = tuple(field.name for field in fields(StreamState))
 POINTS = tuple(field.name for field in fields(AffinePoints))
 
+NAMES = {IMAGE, LATENT, SUMMARY, STABILIZED, *STATE, *POINTS, "depth", "disparity"}
+
 Tensors = dict[str, Tensor]
 
 
 class Part(nn.Module):
     """Named tensors in, named tensors out.
 
-    inputs, outputs: examples, by name, in the order of forward's arguments and results.
+    inputs, outputs: examples, by name, in the order of forward's arguments and results; the outputs
+    are computed when they are asked for.
     """
 
     def __init__(
@@ -48,8 +52,12 @@ class Part(nn.Module):
         """module: has the parameters. step: what the part does with named tensors."""
         super().__init__()
         self.module, self.step, self.inputs = module, step, inputs
+
+    @cached_property
+    def outputs(self) -> Tensors:
+        """See the class."""
         with torch.inference_mode():
-            self.outputs = step(inputs)
+            return self.step(self.inputs)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """See `inputs` and `outputs`."""
@@ -81,11 +89,15 @@ def stabilize_part(stabilizer: DyFN, features: Tensor) -> Part:
     return Part(stabilizer, step, {LATENT: features, **state_tensors(state.without_history())})
 
 
-def decode_part(model: GeometryModel, latent: Latent) -> Part:
-    """The decoder, for latents of the shape and the sizes of `latent`, with normals if it can."""
+def decode_part(model: GeometryModel, latent: Latent, normals: bool = False) -> Part:
+    """The decoder, for latents of the shape and the sizes of `latent`.
+
+    normals: with the normals of models that have them.
+    """
+    decode = model.decode_all if normals else model.decode
 
     def step(inputs: Tensors) -> Tensors:
-        return affine_tensors(model.decode_all(latent_from(inputs, latent)))
+        return affine_tensors(decode(latent_from(inputs, latent)))
 
     return Part(model, step, latent_tensors(latent))
 

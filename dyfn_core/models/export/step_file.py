@@ -13,8 +13,7 @@ import torch
 
 from dyfn_core import __version__
 from dyfn_core.files import finished_file
-from dyfn_core.models.base import AffineDepth, GeometryModel, Latent, Prepared, plane
-from dyfn_core.models.checkpoints import CheckpointError, full_config, model_fingerprint
+from dyfn_core.models.base import GeometryModel, Latent, Prepared, plane
 from dyfn_core.models.export.onnx_graph import exported, joined
 from dyfn_core.models.export.parts import (
     decode_part,
@@ -22,6 +21,8 @@ from dyfn_core.models.export.parts import (
     stabilize_part,
     state_tensors,
 )
+from dyfn_core.models.formats import CheckpointError
+from dyfn_core.models.identity import full_config, model_fingerprint
 from dyfn_core.prediction import StreamState
 
 KEY = "dyfn_ros"  # of the file's metadata
@@ -116,10 +117,6 @@ def _info(
 ) -> StepInfo:
     """latent, state: what goes into the decoder, and DyFN's state after a frame."""
     shapes = {} if state is None else state_tensors(state)
-    metres = None
-    if model.knows_metres == "camera":
-        affine = model.decode(latent)
-        metres = affine.metres_of_focal if isinstance(affine, AffineDepth) else None
     return StepInfo(
         version=__version__,
         weights=model_fingerprint(model),
@@ -133,7 +130,7 @@ def _info(
         mask_threshold=model.mask_threshold,
         state={name: list(value.shape) for name, value in shapes.items()},
         first_state={name: FIRST_STATE[name] for name in shapes},
-        metres_of_focal=metres,
+        metres_of_focal=model.metres_of_focal(latent.network_size),
     )
 
 
