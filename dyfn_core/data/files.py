@@ -123,8 +123,12 @@ def registered(image: np.ndarray, depth: np.ndarray, path: Path) -> tuple[np.nda
 
 
 def read_colour(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
-    """H x W x 3 uint8 RGB. Raises FrameError: unreadable, or not of the size (H, W)."""
-    pixels = _decoded(path, cv2.IMREAD_COLOR)
+    """H x W x 3 uint8 RGB. Raises FrameError: unreadable, or not of the size (H, W).
+
+    Pixels stay where they are stored, whatever EXIF says of the side that is up: depth and
+    intrinsics are of these.
+    """
+    pixels = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if size is not None and pixels.shape[:2] != size:
         raise FrameError(f"{path}: expected an image of {size}, got {pixels.shape[:2]}")
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)

@@ -17,7 +17,12 @@ from dyfn_ros.recordings.rgbd_folder import PLAIN_RATE, as_recorded
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
 from dyfn_ros.recordings.storage.open import is_recording
 from dyfn_ros.recordings.topics import Topics
-from dyfn_ros.recordings.video_file import expected_frames, is_video_name, video_frames
+from dyfn_ros.recordings.video_file import (
+    expected_frames,
+    is_video_name,
+    video_frames,
+    video_tracks,
+)
 
 _OF_DEPTH = re.compile(r"(?:^|[^a-z])(?:depth|disp|disparity)(?:[^a-z]|$)")
 
@@ -48,6 +53,13 @@ class ImageRecording:
                 f"{len(of_depth)} files of depth by their names ({of_depth[0]}, ...): not read in "
                 f"this folder of pictures; with depth is {EXPECTED}"
             ] = 1
+        if kinds := _kinds_of_names(self._pictures):
+            self._warnings[
+                f"pictures of several kinds by their names ({', '.join(kinds)}) are taken for one "
+                "sequence; give each a folder of its own"
+            ] = 1
+        if path.is_file() and (tracks := video_tracks(path)) > 1:
+            self._warnings[f"of {tracks} tracks of pictures in {path.name} one is read"] = 1
         self.notes = Notes(warnings=self._warnings.copy())
 
     @property
@@ -78,6 +90,20 @@ def _without_depth(folder: Path) -> tuple[list[Path], list[Path]]:
         return found, []
     held = visible_files(folder)
     return pictures, [path for path in held if _OF_DEPTH.search(path.name.lower())]
+
+
+def _kinds_of_names(paths: list[Path]) -> list[str]:
+    """Names without their numbers, when several of these have a number in common."""
+    numbers: dict[str, set[str]] = {}
+    for path in paths:
+        kind = re.sub(r"\d+", "#", path.stem)
+        numbers.setdefault(kind, set()).update(["-".join(re.findall(r"\d+", path.stem))])
+    shared = Counter(number for found in numbers.values() for number in found)
+    return [
+        kind
+        for kind, found in numbers.items()
+        if "#" in kind and any(shared[number] > 1 for number in found)
+    ]
 
 
 def _pictures(paths: list[Path], lose: Callable[[str], None]) -> Iterator[FrameToRecord]:

@@ -15,7 +15,7 @@ from dyfn_ros.recordings.rgbd_folder import RgbdRecording, is_rgbd_folder
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, write_rgbd_recording
 from dyfn_ros.recordings.ros import BagRecording
 from dyfn_ros.recordings.storage.open import Storage, open_storage
-from dyfn_ros.recordings.topics import Topics, choose_topics
+from dyfn_ros.recordings.topics import Topics, choose_topics, realsense_scale
 from dyfn_ros.recordings.topics import image_topics as list_image_topics
 from dyfn_ros.recordings.typestore import POINT_CLOUD
 from dyfn_ros.recordings.writer import RecordingWriter
@@ -76,6 +76,7 @@ def open_recording(
         path, storage, image_topic, camera_info_topic, depth_topic, depth_info_topic
     )
     _check_depth(path, storage, topics, transform, quantity)
+    depth_scale = depth_scale or realsense_scale(storage, topics.depth)
     return BagRecording(
         path, storage, topics, tolerance, transform, stamps, quantity, depth_scale, depth_offset
     )

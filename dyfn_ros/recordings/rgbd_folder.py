@@ -13,8 +13,13 @@ from dyfn_core.data.files import registered
 from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import FolderCamera
 from dyfn_core.data.rgbd.folder import FrameFiles, RgbdFolder
-from dyfn_core.data.rgbd.layouts import PLAIN, FolderOptions, layout_of, open_folder
-from dyfn_core.data.rgbd.names import entry
+from dyfn_core.data.rgbd.layouts import (
+    PLAIN,
+    FolderOptions,
+    depth_folder,
+    layout_of,
+    open_folder,
+)
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, in_nanoseconds
@@ -153,7 +158,7 @@ class RgbdRecording:
         self.path = path
         self._warnings: Counter[str] = Counter()
         self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]), options)
-        has_depth = bool(self._folder.with_depth) or entry(path, "depth").is_dir()
+        has_depth = bool(self._folder.with_depth) or depth_folder(path).is_dir()
         self.topics = Topics("rgb/", "K.txt", "depth/" if has_depth else None)
         self.notes = Notes(warnings=self._warnings.copy())
 

@@ -37,6 +37,7 @@ _OTHER_LIGHT = re.compile(
     r"|(?:^|[/_])n?ir_?\d*(?:[/_]|$)"
 )
 _SAYS_DEPTH = re.compile(r"depth|range|distance|(?:^|[/_])(?:tof|z)\d*(?:[/_]|$)")
+_OF_SDK = re.compile(r"(/device_\d+/sensor_\d+)/Depth_\d+/image/data")
 _RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 WIDE_GREY = {"mono16", *DEPTH_ENCODINGS}  # what shows no colours
 # Parts of names that say what an image is, not whose.
@@ -79,13 +80,14 @@ class _Found:
 
     colours, depths: candidates, each in one transport. encodings: of raw images. unread: of the
     topics that are of depth by their names, those that are not read as depth by themselves, with
-    what they hold.
+    what they hold. damaged: of topics whose first messages cannot be read, why.
     """
 
     colours: list[str]
     depths: list[str]
     encodings: dict[str, str]
     unread: dict[str, str]
+    damaged: dict[str, str]
 
 
 def choose_topics(
@@ -112,7 +114,7 @@ def choose_topics(
     coloured = [n for n in visible if found.encodings.get(n) not in WIDE_GREY] or visible
     chosen = _named(path, kinds, image, set(PICTURES)) or _only(path, kinds, coloured, "image")
     if chosen is None:
-        raise _no_image(path, storage, kinds)
+        raise _no_image(path, storage, kinds, found)
     depths = [d for d in found.depths if d != chosen]
     truth = _optional(
         path,
@@ -123,6 +125,10 @@ def choose_topics(
     )
     info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
     remarks = [] if depth is not None else [*_depth_remarks(found, depths, chosen, truth)]
+    remarks += [f"not used: {text}" for name, text in found.damaged.items() if name != chosen]
+    clouds = [name for name, kind in kinds.items() if kind == POINT_CLOUD]
+    if truth is None and depth is None and clouds:
+        remarks.append(f"{', '.join(sorted(clouds))}: ground truth when --depth-topic names it")
     if camera_info is None and info is not None and _apart(chosen, info):
         remarks.append(
             f"{info} is the only CameraInfo, in another namespace than {chosen}: of another "
@@ -187,10 +193,12 @@ def _kinds(storage: Storage) -> dict[str, str]:
     return {name: topic.kind for name, topic in storage.topics.items() if topic.count}
 
 
-def _no_image(path: Path, storage: Storage, kinds: dict[str, str]) -> RecordingError:
+def _no_image(path: Path, storage: Storage, kinds: dict[str, str], found: _Found) -> RecordingError:
     text = f"no colour image topic; it holds {_listing(kinds, kinds)}"
     pictures = [name for name, kind in kinds.items() if kind in PICTURES]
-    if pictures:
+    if found.damaged:
+        text += f"; {'; '.join(found.damaged.values())}"
+    elif pictures:
         text += "; --image-topic takes one that is taken for depth or a picture of depth"
     return RecordingError("; ".join([f"{path}: {text}", *_empty(storage)]))
 
@@ -254,15 +262,28 @@ def listed_topics(storage: Storage) -> str:
     return _listing(kinds, kinds)
 
 
+def realsense_scale(storage: Storage, depth: str | None) -> float | None:
+    """Stored values per metre of a depth topic in a bag of the RealSense SDK, which records the
+    sensor's unit beside it; None without one."""
+    place = _OF_SDK.fullmatch(depth or "")
+    unit = f"{place.group(1)}/option/Depth_Units/value" if place else ""
+    if unit not in storage.topics:
+        return None
+    message = _first(storage, unit)
+    metres = float(getattr(message, "data", 0.0))
+    return round(1 / metres, 3) if metres > 0 else None
+
+
 def image_topics(path: Path, storage: Storage) -> list[str]:
     """Every colour image topic, one of each that is recorded both raw and compressed.
 
     Raises RecordingError when there is none.
     """
     kinds = _kinds(storage)
-    colours = _classify(storage, kinds).colours
+    found = _classify(storage, kinds)
+    colours = found.colours
     if not colours:
-        raise _no_image(path, storage, kinds)
+        raise _no_image(path, storage, kinds, found)
     return colours
 
 
@@ -308,12 +329,15 @@ def _listing(kinds: dict[str, str], names: list[str] | dict[str, str]) -> str:
 
 def _classify(storage: Storage, kinds: dict[str, str]) -> _Found:
     """Colour and depth candidates, by the first message of each image topic."""
-    found = _Found([], [], {}, {})
+    found = _Found([], [], {}, {}, {})
     for name, kind in sorted(kinds.items()):
         if kind == DISPARITY_IMAGE:
             found.unread[name] = kind
         message = _first(storage, name) if kind in PICTURES else None
         if message is None:
+            continue
+        if isinstance(message, RecordingError):
+            found.damaged[name] = str(message)
             continue
         held = str(message.encoding if kind == IMAGE else getattr(message, "format", kind))
         if kind == IMAGE:
@@ -352,13 +376,14 @@ def _pictures_depth(name: str) -> bool:
 
 
 def _first(storage: Storage, name: str) -> Any:
-    """The first message that can be read; None when none of the first few can."""
+    """The first message that can be read; the error when none of the first few can."""
+    problem: RecordingError | None = None
     for recorded in islice(storage.messages([name]), TRIES):
         try:
             return recorded.message()
-        except RecordingError:  # counted when it is read as a frame
-            continue
-    return None
+        except RecordingError as error:  # counted when it is read as a frame
+            problem = error
+    return problem
 
 
 def _nearest(depths: list[str], image: str) -> list[str]:

@@ -19,6 +19,7 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".gif"),
     *(".h264", ".264", ".h265", ".265", ".hevc"),  # streams without a container, and times
 )
+COVER = 0x400  # a track that is a picture of the cover, in its disposition
 SHORT = 2.0  # seconds that a file may end before its announced length
 Warn = Callable[[str], None]
 
@@ -35,6 +36,20 @@ def expected_frames(path: Path) -> int:
         return max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     finally:
         video.release()
+
+
+def video_tracks(path: Path) -> int:
+    """How many sequences of pictures a video holds (of cameras that record depth beside colour);
+    0 when PyAV, of the extra `video`, is not installed or cannot say."""
+    try:
+        import av
+    except ImportError:
+        return 0
+    try:
+        with av.open(str(path)) as video:
+            return sum(not track.disposition & COVER for track in video.streams.video)
+    except (av.FFmpegError, OSError, ValueError):
+        return 0
 
 
 def video_frames(

@@ -13,12 +13,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import zstandard
+from rosbags.rosbag1 import Reader as Bag1Reader
+from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from dyfn_ros.recordings.typestore import IMAGE, TYPES, Lens
+from dyfn_ros.recordings.typestore import IMAGE, TYPES, Lens, header
 from tests.support.formats_of_bags import (
     COLOUR,
     COUNT,
+    TRUTH,
     Event,
     Maker,
     bag,
@@ -34,6 +37,7 @@ from tests.support.formats_of_bags import (
     truths,
     whole,
 )
+from tests.support.made_recordings import ROS1
 from tests.support.numbered import depth, picture
 
 BARREL = Lens("plumb_bob", (-0.3, 0.1, 0.0, 0.0, 0.0))
@@ -79,15 +83,22 @@ def gzipped(folder: Path) -> Path:
     return path
 
 
-def big_endian_cdr(folder: Path) -> Path:
+def serialised(
+    folder: Path, change: Callable[[Event, bytes], bytes], little_endian: bool = True
+) -> Path:
+    """A rosbag2 folder of messages whose bytes are changed."""
     with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         for event in whole():
             key = event.topic, event.kind
             known = {(c.topic, c.msgtype): c for c in writer.connections}
             connection = known.get(key) or writer.add_connection(*key, typestore=TYPES)
-            data = TYPES.serialize_cdr(event.message, event.kind, little_endian=False)
-            writer.write(connection, event.log_ns, data)
+            data = TYPES.serialize_cdr(event.message, event.kind, little_endian=little_endian)
+            writer.write(connection, event.log_ns, change(event, bytes(data)))
     return folder / "bag"
+
+
+def big_endian_cdr(folder: Path) -> Path:
+    return serialised(folder, lambda event, data: data, little_endian=False)
 
 
 def big_endian_pixels() -> list[Event]:
@@ -141,6 +152,62 @@ def uncalibrated() -> list[Event]:
     return [*colours(), *truths(), *described]
 
 
+def cut_depth(folder: Path) -> Path:
+    """Of each message of depth only the beginning is there."""
+    return serialised(folder, lambda event, data: data[:30] if event.topic == TRUTH else data)
+
+
+def other_cdr(folder: Path) -> Path:
+    """A head that says XCDR 2, which aligns numbers of 8 bytes in another way."""
+    return serialised(folder, lambda event, data: b"\0\7" + data[2:])
+
+
+def clouds() -> list[Event]:
+    kind = "sensor_msgs/msg/PointCloud2"
+    fields = [
+        TYPES.types["sensor_msgs/msg/PointField"](name=name, offset=4 * at, datatype=7, count=1)
+        for at, name in enumerate("xyz")
+    ]
+    found = []
+    for index in range(COUNT):
+        cloud = TYPES.types[kind](
+            header=header(stamp(index), "lidar"),
+            height=1,
+            width=2,
+            fields=fields,
+            is_bigendian=False,
+            point_step=12,
+            row_step=24,
+            data=np.ones(6, np.float32).view(np.uint8),
+            is_dense=True,
+        )
+        found.append(Event("/points", kind, stamp(index), cloud))
+    return found
+
+
+def realsense(folder: Path) -> Path:
+    """A bag of the SDK, whose sensor counts tenths of millimetres."""
+    sensor = "/device_0/sensor_0"
+    events = [
+        *colours("/device_0/sensor_1/Color_0/image/data"),
+        *infos("/device_0/sensor_1/Color_0/info/camera_info"),
+        *truths(f"{sensor}/Depth_0/image/data", "mono16", lambda i: 10 * millimetres(i)),
+    ]
+    path = bag1(folder / "walk.bag", events)
+    unit = f"{sensor}/option/Depth_Units/value"
+    with Bag1Writer(folder / "unit.bag") as writer:
+        connection = writer.add_connection(unit, "std_msgs/msg/Float32", typestore=ROS1)
+        writer.write(connection, 1, struct.pack("<f", 1e-4))
+        with Bag1Reader(path) as reader:
+            topics = {
+                c.topic: writer.add_connection(c.topic, c.msgtype, typestore=ROS1)
+                for c in reader.connections
+            }
+            for known, at, data in reader.messages():
+                writer.write(topics[known.topic], at, data)
+    return folder / "unit.bag"
+
+
 FILES: dict[str, Maker] = {
     "split, listed in another order": reversed_list,
     "the same as `.mcap` and `.db3`, no `metadata.yaml`": twins,
@@ -148,6 +215,7 @@ FILES: dict[str, Maker] = {
     "a link that leads nowhere": broken_link,
     "`.bag.gz`": gzipped,
     "CDR, most significant byte first": big_endian_cdr,
+    "CDR that says to be XCDR 2": other_cdr,
 }
 MESSAGES: dict[str, Maker] = {
     "`image_rect...` with a CameraInfo that has a lens": of(rectified),
@@ -161,4 +229,7 @@ MESSAGES: dict[str, Maker] = {
     "rows with padding": of(padded),
     "CameraInfo with binning": of(binned),
     "CameraInfo with K all 0": of(uncalibrated),
+    "depth whose messages cannot be read": cut_depth,
+    "PointCloud2 and no depth image": of(lambda: [*colours(), *clouds()]),
+    "RealSense SDK, depth in tenths of millimetres": realsense,
 }

@@ -37,9 +37,9 @@ from dyfn_core.data.rgbd.names import (
     frame_numbers,
     nearest,
     paired,
-    times_in,
     visible_files,
 )
+from dyfn_core.data.rgbd.units import MILLIMETRES, TUM_UNIT, signs_of_another
 
 LAYOUTS = TUM, ASSOCIATIONS, SEVEN_SCENES, SCANNET, PLAIN = (
     "tum",
@@ -57,6 +57,15 @@ ASSOCIATION_FILES = ("associations.txt", "associate.txt", "association.txt", "as
 _NAMED = r"[\d.]+\s+\S*(?:rgb|colou?r|depth)\S*"
 _ASSOCIATION = re.compile(rf"{_NAMED}\s+{_NAMED}")
 COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")  # all but the first: beside depth/
+# Of depth laid over the colour images, before the sensor's own, which is in the last.
+DEPTH_FOLDERS = (
+    "aligned_depth",
+    "depth_aligned",
+    "aligned_depth_to_color",
+    "depth_registered",
+    "registered_depth",
+    "depth",
+)
 CAMERA_FILES = (
     "K.txt",
     "intrinsics.txt",
@@ -67,7 +76,6 @@ CAMERA_FILES = (
 SENSOR_INFO = ("info.txt", "_info.txt")  # of frames exported from a .sens file
 COLOUR_SUFFIXES, DEPTH_SUFFIXES = (".jpg", ".jpeg", ".png"), (".png",)
 TEXT_SUFFIXES = ("", ".txt", ".csv", ".json", ".yaml", ".yml", ".md", ".db", ".ini")
-MILLIMETRES, TUM_UNIT = 1000.0, 5000.0  # stored depth values per metre
 GROUND_TRUTH = "groundtruth.txt"
 Poses = Mapping[Path, np.ndarray]  # by colour file
 
@@ -104,7 +112,7 @@ def layout_of(folder: Path) -> str | None:
         return ASSOCIATIONS
     if next(folder.glob("frame-*.color.*"), None) is not None:
         return SEVEN_SCENES
-    colour, depth = _colour_folder(folder), entry(folder, "depth")
+    colour, depth = _colour_folder(folder), depth_folder(folder)
     if colour.name.lower() == "color" and entry(folder, "intrinsic").is_dir():
         return SCANNET
     if not colour.is_dir():
@@ -114,6 +122,12 @@ def layout_of(folder: Path) -> str | None:
 
 def _colour_folder(folder: Path) -> Path:
     return entry(folder, *COLOUR_FOLDERS)
+
+
+def depth_folder(folder: Path) -> Path:
+    """Where the depth of a folder with pictures is, be it there or not."""
+    place = entry(folder, *DEPTH_FOLDERS)
+    return place if place.is_dir() else entry(folder, DEPTH_FOLDERS[-1])
 
 
 def _camera_file(folder: Path, report: DataReport) -> Path:
@@ -185,13 +199,9 @@ def _plain(folder: Path, report: DataReport, options: FolderOptions) -> RgbdFold
             raise DataError(f"{table}: {len(rows)} poses for {len(images)} images")
         poses = {image: row for image, row in zip(images, rows, strict=True) if _finite(row)}
     frames = _in_folders(folder, images, poses, report)
-    by_time = times_in([frame.image for frame in frames if frame.depth is not None])
-    if by_time and options.depth_scale is None and any(time % 1 for time in by_time):
-        report.miss(
-            "files named by times, as TUM RGB-D's are, whose depth has 5000 values a metre; "
-            f"read as {MILLIMETRES:g} a metre (--depth-scale)",
-            folder,
-        )
+    if options.depth_scale is None and any(frame.depth is not None for frame in frames):
+        for sign in signs_of_another(folder, [f.image for f in frames if f.depth is not None]):
+            report.miss(f"{sign}; read as {MILLIMETRES:g} a metre (--depth-scale)", folder)
     calibration = options.calibration(_camera_file(folder, report))
     return RgbdFolder(folder, PLAIN, frames, calibration, options.depth_scale or MILLIMETRES)
 
@@ -347,7 +357,10 @@ def _in_folders(
     folder: Path, images: list[Path], poses: Poses, report: DataReport
 ) -> tuple[FrameFiles, ...]:
     """The frames of these colour files, with depth/*.png that belong to them by name."""
-    place = entry(folder, "depth")
+    place = depth_folder(folder)
+    for other in subfolders(folder):
+        if place.is_dir() and other != place and other.name.lower() in DEPTH_FOLDERS:
+            report.miss(f"folder of depth that is not read ({place.name}/ is, by its name)", other)
     depths = _files(place, DEPTH_SUFFIXES, report)
     pairs = paired(images, depths)
     if place.is_dir():

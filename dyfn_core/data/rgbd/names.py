@@ -15,6 +15,7 @@ from dyfn_core.data.files import hidden
 
 FIRST_TIME = 10**8  # numbers from here on are times, not frame numbers
 TOLERANCE = 0.02  # seconds between a colour frame and its depth or pose
+_COUNTED = re.compile(r"\d{7}-(\d{12})")
 Thing = TypeVar("Thing")
 Key = Callable[[Path], Hashable]
 
@@ -67,7 +68,10 @@ def in_seconds(stamp: Decimal | float) -> float:
 
 
 def times_in(paths: Sequence[Path]) -> list[float] | None:
-    """Seconds, by names that are times; None when not all are."""
+    """Seconds, by names that are times, or NUMBER-MICROSECONDS (Redwood); None when not all are."""
+    counted = [_COUNTED.fullmatch(path.stem) for path in paths]
+    if paths and all(counted):
+        return [int(match.group(1)) * 1e-6 for match in counted if match]
     found = [numbers_in(path) for path in paths]
     if not all(len(numbers) == 1 and numbers[0] >= FIRST_TIME for numbers in found):
         return None

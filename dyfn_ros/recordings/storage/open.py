@@ -31,6 +31,7 @@ READERS: dict[str, Callable[[Path], Storage]] = {
 }
 SUFFIXES = (".mcap", ".db3", ".bag", ".bag.active")
 PACKED = (".zstd", ".zst")  # rosbag2's compression by file
+ARCHIVES = (".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".7z", ".rar")
 EXPECTED = (
     "a rosbag2 folder, an .mcap, .db3 or .bag file (also .zstd of one), an RGB-D folder, a video "
     "file or a folder of pictures"
@@ -126,7 +127,7 @@ def _open_folder(path: Path) -> Storage:
     contents = _contents(path)
     if not contents.files:
         inner = [d for d in sorted(path.iterdir()) if d.is_dir() and is_recording(d)]
-        held = f"; it holds {', '.join(map(str, inner))}" if inner else ""
+        held = f"; it holds {', '.join(map(str, inner))}" if inner else _other_contents(path)
         raise RecordingError(
             f"{path}: expected a rosbag2 folder (metadata.yaml and .mcap or .db3 files) "
             f"or an RGB-D folder (rgb/, depth/, K.txt){held}{contents.problem}"
@@ -157,6 +158,21 @@ def _open_folder(path: Path) -> Storage:
     remarks += [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
     remarks += [f"{f}: not read, by its name a copy in another format" for f in contents.copies]
     return ChainedStorage([*(listed or parts).values()], [*contents.missing, *losses], remarks)
+
+
+def _other_contents(folder: Path) -> str:
+    """Archives, and folders that may be of pictures, as the end of an error."""
+    entries = sorted(entry for entry in folder.iterdir() if not hidden(entry))
+    packed = [entry.name for entry in entries if entry.name.lower().endswith(ARCHIVES)]
+    if packed:
+        return f"; it holds {', '.join(packed[:_NAMED])}: unpack"
+    folders = [f"{entry.name}/" for entry in entries if entry.is_dir()]
+    if folders:
+        return (
+            f"; it holds {', '.join(folders[:_NAMED])}: a folder of pictures alone is read, "
+            "without depth"
+        )
+    return ""
 
 
 def _in_time(folder: Path, parts: dict[Path, Storage]) -> tuple[dict[Path, Storage], list[str]]:

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from dyfn_core.data.files import read_colour
 from dyfn_core.data.frames import DataError, DataReport, FrameError
 from dyfn_core.data.rgbd.cameras import FolderCamera, published_camera, read_camera
 from dyfn_core.data.rgbd.folder import RgbdFolder
 from dyfn_core.data.rgbd.layouts import FolderOptions, find_folders, layout_of, open_folder
 from dyfn_core.data.rgbd.names import frame_numbers, in_numeric_order, paired
+from dyfn_core.data.rgbd.units import signs_of_another
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 from tests.support.rgbd_folders import (
     MATRIX,
@@ -394,3 +397,41 @@ def test_a_picture_that_git_lfs_did_not_fetch_is_told_so(tmp_path: Path) -> None
     folder, _ = opened(tmp_path)
     with pytest.raises(FrameError, match="Git LFS pointer: `git lfs pull`"):
         folder.depth(folder.frames[0])
+
+
+def test_pixels_stay_as_stored_whatever_exif_says(tmp_path: Path) -> None:
+    pixels = np.zeros((8, 8, 3), np.uint8)
+    pixels[:4] = 255
+    picture = Image.fromarray(pixels)
+    tags = picture.getexif()
+    tags[0x0112] = 3  # upside down
+    picture.save(tmp_path / "0.jpg", exif=tags, quality=100)
+    np.testing.assert_allclose(read_colour(tmp_path / "0.jpg"), pixels, atol=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("cam_params.json", '{"camera": {"scale": 6553.5}}', 'scale": 6553.5'),
+        (
+            "config.yaml",
+            "cam:\n  png_depth_scale: 5000.0 # here\n",
+            "png_depth_scale: 5000.0",
+        ),
+        ("orb.yaml", "DepthMapFactor: 5000.0\n", "DepthMapFactor: 5000.0"),
+        ("a.json", '{"depth_scale": 1000.0}', ""),
+        ("a.json", '{"depth_scale": 0.001}', ""),
+        ("a.json", '{"grayscale": 7, "scaled": 3, "scale": true}', ""),
+    ],
+)
+def test_another_scale_beside_is_said(tmp_path: Path, name: str, text: str, said: str) -> None:
+    (tmp_path / name).write_text(text)
+    found = [*signs_of_another(tmp_path, [tmp_path / "rgb/0.png"])]
+    assert found == ([f"{name} says {said!r}, which may be of the depth"] if said else [])
+
+
+def test_redwoods_names_pair_by_their_microseconds() -> None:
+    images = [Path(f"{number:07d}-{33_333 * number:012d}.jpg") for number in range(4)]
+    depths = [Path(f"{number + 1:07d}-{33_333 * number + 9000:012d}.png") for number in range(4)]
+    assert paired(images, depths) == dict(zip(images, depths, strict=True))
+    assert paired(images, [Path(f"{n:07d}-{33_333 * n + 25_000:012d}.png") for n in (9, 10)]) == {}

@@ -13,10 +13,11 @@ from dyfn_ros.recordings.open import open_recording
 from tests.support.formats_of_bags import BAGS, COUNT, Maker
 from tests.support.formats_of_folders import FOLDERS
 from tests.support.formats_of_messages import FILES, MESSAGES
+from tests.support.formats_of_other_folders import OTHER_FOLDERS
 from tests.support.numbered import numbers
 
 PAGE = Path(__file__).parents[3] / "docs" / "recordings.md"
-MAKERS: dict[str, Maker] = {**BAGS, **FILES, **MESSAGES, **FOLDERS}
+MAKERS: dict[str, Maker] = {**BAGS, **FILES, **MESSAGES, **FOLDERS, **OTHER_FOLDERS}
 
 
 class Line(NamedTuple):
