@@ -46,9 +46,9 @@ def install(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_everything_is_where_ros_looks_for_it(install: Path) -> None:
     assert (install / "lib/dyfn_ros/stream_depth").stat().st_mode & 0o111
     share = install / "share/dyfn_ros"
-    names = ["launch/stream_depth.launch.py", "launch/stream_depth_cameras.launch.py"]
-    names += ["package.xml", "config/stream_depth.yaml", "config/cameras/realsense.yaml"]
-    names += ["config/recipes/stream_depth_nav2.yaml"]
+    names = ["package.xml", "config/stream_depth.yaml"]
+    for folder in ("launch", "config/cameras", "config/recipes"):
+        names += [f"{folder}/{path.name}" for path in (ROOT / folder).glob("*.*")]
     for name in names:
         assert (share / name).is_file(), name
     assert (install / "share/ament_index/resource_index/packages/dyfn_ros").is_file()
