@@ -25,8 +25,10 @@ from dyfn_core.models import load_model
 from dyfn_core.models.base import GeometryModel, Latent
 from dyfn_core.models.dyfn import DyFNConfig, build_dyfn
 from dyfn_ros.messages.images import decode_depth
+from dyfn_ros.node.camera import Camera
 from dyfn_ros.node.log_throttle import Throttle
 from dyfn_ros.node.node import StreamDepthNode
+from tests.support.faults.measurements import measurement
 from tests.support.node_here import running_node
 from tests.support.pinhole import PinholeModel
 from tests.support.probe import Probe, stamp_of, stamped
@@ -42,7 +44,23 @@ LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 OF_DIAGNOSTICS = {b"\0": "OK", b"\1": "WARN", b"\2": "ERROR", b"\3": "STALE"}
 
 RAW, PACKED = "raw", "packed"
-CAMERAS: dict[str, dict[str, str]] = {RAW: {}, PACKED: {"image_transport": "compressed"}}
+CAMERAS: dict[str, dict[str, Any]] = {RAW: {}, PACKED: {"image_transport": "compressed"}}
+MEASURED = {  # cameras beside a sensor, and the type of its messages
+    "cloud": "PointCloud2",
+    "scan": "LaserScan",
+    "sonar": "Range",
+    "dense": "Image",
+}
+for _name, _type in MEASURED.items():
+    CAMERAS[_name] = {
+        "metric_source": "reference",
+        "reference_type": _type,
+        "calibration_seconds": 0.25,
+        "calibration_points": 3,
+        "after_reset": "withhold",
+        "max_gap": 0.0,  # while another camera's faults are done
+    }
+METRES = 2.0  # in one unit of the model, as the sensors see it
 
 
 class FaultyPinhole(PinholeModel):
@@ -57,9 +75,10 @@ class FaultyPinhole(PinholeModel):
 def scene(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
     """H x W x 3 uint8 of red blocks: for every seed another scene for FaultyPinhole."""
     height, width = size
-    coarse = np.random.default_rng(seed).integers(20, 236, (height // 4 + 1, width // 4 + 1))
+    coarse = np.random.default_rng(seed).integers(20, 236, (height // 4 + 2, width // 4 + 2))
     image = np.zeros((height, width, 3), np.uint8)
-    image[..., 0] = coarse.repeat(4, 0).repeat(4, 1)[:height, :width]
+    # The middle is inside a block.
+    image[..., 0] = coarse.repeat(4, 0).repeat(4, 1)[2 : height + 2, 2 : width + 2]
     return image
 
 
@@ -197,10 +216,14 @@ class Bench:
         found = self.depths(camera, stamp)
         return found[-1] if len(found) > known else None
 
+    def camera(self, name: str) -> Camera:
+        """The node's own."""
+        (found,) = (one for one in self.node._cameras if one.name == name)
+        return found
+
     def lost(self, camera: str) -> int:
         """Pictures that the node could not use, or failed on."""
-        (found,) = (one for one in self.node._cameras if one.name == camera)
-        counts = found.statistics.counts
+        counts = self.camera(camera).statistics.counts
         return counts["bad"] + counts["failed"]
 
     def right(self, depth: np.ndarray, image: np.ndarray) -> bool:
@@ -210,15 +233,23 @@ class Bench:
         good = np.abs(depth / true_depth(image) - 1) < 0.01
         return bool(good.mean() > 0.9)
 
+    def measure(self, camera: str, image: np.ndarray, stamp: int) -> None:
+        """Let the sensor beside the camera measure such a scene, if there is one."""
+        if camera in MEASURED:
+            message = measurement(MEASURED[camera], METRES * true_depth(image))
+            self.probe.publish(f"/{camera}/reference", stamped(message, stamp, ""))
+
     def recover(self, camera: str) -> Recovery:
         """Send scenes one at a time until one has the right depth."""
         start = time.monotonic()
         for count in range(1, 100):
             image, stamp = self.fresh(), self.step()
             known = len(self.depths(camera, stamp))
+            self.measure(camera, image, stamp)
             self.send_scene(camera, image, stamp)
             self.probe.spin_until(lambda s=stamp, k=known: len(self.depths(camera, s)) > k, RESEND)
-            if any(self.right(depth, image) for depth in self.depths(camera, stamp)[known:]):
+            unit = METRES if camera in MEASURED else 1.0
+            if any(self.right(depth / unit, image) for depth in self.depths(camera, stamp)[known:]):
                 return Recovery(count, time.monotonic() - start)
             assert time.monotonic() - start < PATIENCE, f"no good depth after {count} pictures"
         raise AssertionError("no good depth after 100 pictures")

@@ -12,7 +12,14 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.support.faults import models, pictures, requests, state_files
+from tests.support.faults import (
+    camera_infos,
+    models,
+    pictures,
+    references,
+    requests,
+    state_files,
+)
 from tests.support.faults.bench import Bench, faulty_bench
 from tests.support.faults.fault import Fault, Row, run
 from tests.support.ros_graph import own_domain
@@ -34,6 +41,8 @@ class Kind:
 
 KINDS = (
     Kind("Pictures", pictures.FAULTS),
+    Kind("Camera infos", camera_infos.FAULTS),
+    Kind("Measurements for the metric scale", references.FAULTS, references.reference_bench),
     Kind("Requests", requests.FAULTS),
     Kind("State files", state_files.FAULTS, state_files.state_bench),
     Kind("Models and devices", models.FAULTS, models.model_bench),
