@@ -61,6 +61,12 @@ def decode_compressed_depth(
 
 INVERSE_RESOLUTION = 100.0  # as compressed_depth_image_transport: depth_quantization
 FARTHEST = 10.0  # and its depth_max, in the unit of the depth
+# Depth is smooth: rows as differences to the row above are smaller at level 1 than without it at
+# level 4, in half the time. OpenCV before 4.12 cannot be asked for them.
+_UP = getattr(cv2, "IMWRITE_PNG_FILTER_UP", None)
+PNG_OPTIONS = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+if _UP is not None:
+    PNG_OPTIONS += [cv2.IMWRITE_PNG_FILTER, _UP]
 
 
 def encode_compressed_depth(
@@ -82,7 +88,7 @@ def encode_compressed_depth(
         values = np.rint(np.where(inside, a / np.where(inside, depth, 1.0) + b, 0)).astype(
             np.uint16
         )
-    ok, data = cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    ok, data = cv2.imencode(".png", values, PNG_OPTIONS)
     if not ok:
         raise MessageError(f"a depth image of {depth.shape} could not be compressed")
     return f"{encoding}; compressedDepth png", _HEADER.pack(0, a, b) + data.tobytes()
@@ -113,7 +119,7 @@ def encode_depth_range(depth: np.ndarray, valid: np.ndarray) -> tuple[str, bytes
     a, b = (float(np.float32(value)) for value in (a, 1 - a / far))
     codes = np.rint(a / np.where(valid, depth.astype(np.float64), np.inf) + b)
     values = np.where(valid, codes.clip(1, 65_535), 0).astype(np.uint16)
-    ok, data = cv2.imencode(".png", values, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    ok, data = cv2.imencode(".png", values, PNG_OPTIONS)
     if not ok:
         raise MessageError(f"a depth image of {depth.shape} could not be compressed")
     packed = _HEADER.pack(0, a, b) + data.tobytes()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap
 
 from dyfn_core.evaluation.report.html import format_cell
 from dyfn_core.files import finished_file, write_text
@@ -69,6 +68,8 @@ def mean_of(values: Sequence[float]) -> Mean:
     """Percentile bootstrap over recordings, seeded: the same values give the same interval."""
     low = high = None
     if len(values) > 1:
+        from scipy.stats import bootstrap  # half a second, which one recording does without
+
         found = bootstrap(
             (np.array(values, np.float64),),
             np.mean,

@@ -104,25 +104,23 @@ class SourceReader:
         self._remedies = replace(REMEDIES, stamps="") if source.stamps == "log" else REMEDIES
         self._plausibility = Plausibility(self.expected, self._remedies)
 
-    def frames(
-        self, between: Callable[[RecordedFrame], None] = lambda frame: None
-    ) -> Iterator[RecordedFrame]:
-        """Every frame asked for, in the recording's order.
+    def frames(self) -> Iterator[RecordedFrame]:
+        """Every frame asked for, in the recording's order."""
+        return (frame for frame, used in self.every() if used)
 
-        Args:
-            between: Told each frame that the stride leaves out, in its place.
-        """
+    def every(self) -> Iterator[tuple[RecordedFrame, bool]]:
+        """Every frame up to the last one asked for, and whether it is: the stride leaves some
+        out."""
         self._plausibility = Plausibility(self.expected, self._remedies)
         stride, count = self._source.stride, 0
         with closing(self.recording.frames()) as every:
             for index, frame in enumerate(every):
-                if index % stride:
-                    between(frame)
-                    continue
-                stamp, camera = frame.stamp_ns, frame.camera_matrix
-                self._plausibility.push(frame.image, frame.depth, stamp, camera)
-                yield frame
-                count += 1
+                used = index % stride == 0
+                if used:
+                    stamp, camera = frame.stamp_ns, frame.camera_matrix
+                    self._plausibility.push(frame.image, frame.depth, stamp, camera)
+                yield frame, used
+                count += used
                 if count == self._source.max_frames:
                     return
 

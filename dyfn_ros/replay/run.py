@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,10 @@ from dyfn_core.scoring.protocols import SequenceScorer
 from dyfn_core.threads import computing_threads
 from dyfn_ros.recordings.frames import RecordedFrame
 from dyfn_ros.replay.outputs import ReplayOutputs
+from dyfn_ros.replay.pipeline import Behind, ahead
 from dyfn_ros.replay.reader import SourceReader
 from dyfn_ros.replay.results import Result, write_results
-from dyfn_ros.replay.runner import StreamRunner
+from dyfn_ros.replay.runner import RunFrame, StreamRunner
 from dyfn_ros.replay.scores import push_frame
 from dyfn_ros.replay.settings import Outputs, Run, Source
 from dyfn_ros.replay.shown_run import Alignment, ShownRun
@@ -123,18 +125,15 @@ def _evaluate(
     outputs: Outputs,
     write: Write,
 ) -> SequenceEvaluation:
-    """Every frame read, run and scored; `write` takes it too."""
+    """Every frame read, run and scored; `write` takes it too.
+
+    One thread reads ahead of the model and one scores and writes behind it, in the frames' order.
+    """
     evaluation = SequenceEvaluation(
         reader.expected, outputs.depth_max, scored_quantity(model.quantity)
     )
-    frames = tqdm(
-        reader.frames(runner.skip),
-        total=reader.expected,
-        unit="frame",
-        file=sys.stderr,
-        disable=not outputs.progress,
-    )
-    for one in runner.frames(frames):
+
+    def finish(one: RunFrame) -> None:
         score = push_frame(
             evaluation,
             reader,
@@ -146,11 +145,33 @@ def _evaluate(
             None if one.prediction.steady else one.prediction.aligned_quantity,
         )
         write(one.frame, one.prediction, score)
+
+    with closing(ahead(reader.every())) as read, Behind(finish) as behind:
+        frames = tqdm(
+            _used(read, runner),
+            total=reader.expected,
+            unit="frame",
+            file=sys.stderr,
+            disable=not outputs.progress,
+        )
+        for one in runner.frames(frames):
+            behind.push(one)
     for loss, count in runner.losses().items():
         reader.recording.notes.losses[loss] += count
     for warning, count in runner.warnings().items():
         reader.warn(warning, count)
     return evaluation
+
+
+def _used(
+    frames: Iterable[tuple[RecordedFrame, bool]], runner: StreamRunner
+) -> Iterator[RecordedFrame]:
+    """The frames that are run; the runner is told the others, in their place."""
+    for frame, used in frames:
+        if used:
+            yield frame
+        else:
+            runner.skip(frame)
 
 
 def _output(prediction: Prediction[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
