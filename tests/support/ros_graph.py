@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import array
 import fcntl
+import itertools
 import os
 import re
 import select
@@ -37,12 +38,17 @@ from std_srvs.srv import Trigger
 DEADLINE = 240.0  # a busy machine imports torch slowly
 NODE = "/stream_depth"
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+_OPENED = itertools.count()
 
 
 @contextmanager
 def own_domain() -> Iterator[dict[str, str]]:
-    """Environment of a domain that no other test on this machine uses while this is open."""
-    for number in range(1, 100):
+    """Environment of a domain that no other test on this machine uses while this is open.
+
+    Nor did this process lately: who has ended stays known there for a while.
+    """
+    first = os.getpid() + next(_OPENED)
+    for number in (1 + (first + offset) % 99 for offset in range(99)):
         path = Path(tempfile.gettempdir()) / f"dyfn-test-domain-{number}.lock"
         with path.open("a") as lock:
             try:

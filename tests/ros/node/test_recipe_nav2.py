@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,14 +10,21 @@ import numpy as np
 import pytest
 import yaml
 from rclpy.qos import QoSCompatibility, qos_check_compatible, qos_profile_sensor_data
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 
 from dyfn_ros.messages.clouds import cloud_points
 from dyfn_ros.messages.transforms import TransformBuffer
 from tests.support.foreign_parameters import NAV2_COSTMAP, NAV2_SOURCE, NAV2_VOXEL_LAYER
-from tests.support.odometry import tf_message, transform
-from tests.support.recipe_scene import Scene, mount, picture, scene_depth
-from tests.support.recipe_stream import OPTICAL_FRAME, RECIPES, RecipeStream, recipe_stream
+from tests.support.odometry import pose_text, tf_message, transform
+from tests.support.recipe_scene import SIZE, Scene, mount, picture, scene_depth
+from tests.support.recipe_stream import (
+    OPTICAL_FRAME,
+    RECIPES,
+    ROOT,
+    RecipeStream,
+    recipe_stream,
+)
 
 COSTMAP = yaml.safe_load((RECIPES / "nav2_local_costmap.yaml").read_text())["local_costmap"][
     "local_costmap"
@@ -169,7 +177,22 @@ def test_clouds_come_as_often_as_nav2_expects(stream: RecipeStream) -> None:
         assert source.get("expected_update_rate", 10) >= 3 / rate
 
 
-def test_before_there_are_metres_nav2_sees_nothing(stream: RecipeStream) -> None:
-    assert stream.node.settings.until_metric == "withhold"
-    nothing = np.full((4, 3), np.nan)
-    assert all(len(buffered(nothing, source)) == 0 for source in SOURCES.values())
+def test_before_there_are_metres_nav2_sees_nothing() -> None:
+    """The file as it is, without an odometry that comes."""
+    own = {"metric_source": "odometry", "camera_pose": pose_text(MOUNT)}
+    file = RECIPES / "stream_depth_nav2.yaml"
+    with recipe_stream(file, **own, odometry_wait=0.0, points_stride=1) as stream:
+        image = picture(scene_depth(SCENE, MOUNT))
+        points, _ = in_costmap(stream.frame(image, {"points": PointCloud2})["points"])
+    assert len(points) == SIZE[0] * SIZE[1]
+    assert all(len(buffered(points, source)) == 0 for source in SOURCES.values())
+
+
+def test_the_transform_of_the_page_is_that_of_an_optical_frame() -> None:
+    page = (ROOT / "docs/recipes/nav2.md").read_text(encoding="utf-8")
+    given = dict(re.findall(r"--(x|y|z|roll|pitch|yaw) (\S+)", page))
+    angles = [float(given.get(name, 0)) for name in ("roll", "pitch", "yaw")]
+    found = Rotation.from_euler("xyz", angles).as_matrix()  # as static_transform_publisher has it
+    expected = mount(height=float(given["z"]), down=15, x=float(given["x"]))
+    np.testing.assert_allclose(found, expected[:3, :3], atol=1e-3)
+    assert f"--child-frame-id {OPTICAL_FRAME}" in page

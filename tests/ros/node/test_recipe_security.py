@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from importlib.util import find_spec
 from types import ModuleType
 from xml.etree import ElementTree
@@ -72,7 +71,7 @@ def done(node: StreamDepthNode) -> Does:
 def does() -> Iterator[dict[str, Does]]:
     """By configuration; the model has normals."""
     found = {}
-    with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PinholeModel, "has_normals", True, raising=False)
         if find_spec("tf2_msgs") is None:  # no wheels have it; any type shows the topics
             messages = ModuleType("tf2_msgs.msg")
@@ -80,8 +79,8 @@ def does() -> Iterator[dict[str, Does]]:
             patch.setitem(sys.modules, "tf2_msgs", ModuleType("tf2_msgs"))
             patch.setitem(sys.modules, "tf2_msgs.msg", messages)
         for name, parameters in CONFIGURATIONS.items():
-            domain = stack.enter_context(own_domain())  # a node of this name is known for a while
-            with made_node(domain, remappings() + parameters) as node:
+            line = remappings() + parameters
+            with own_domain() as domain, made_node(domain, line) as node:
                 assert node.trigger_configure() == SUCCESS
                 found[name] = done(node)
         yield found
