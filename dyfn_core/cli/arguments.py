@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeAlias
 
 from dyfn_core import __version__
-from dyfn_core.argument_types import at_least_one, device_name, not_negative
+from dyfn_core.argument_types import BACKENDS, at_least_one, device_name, not_negative
 from dyfn_core.threads import THREADS
 
 USAGE_ERROR = 2
@@ -103,6 +103,17 @@ def add_device(options: Options) -> None:
         type=device_name,
         default="auto",
         help="auto (a GPU if there is one), cpu, cuda, cuda:N (default: auto)",
+    )
+
+
+def add_backend(options: Options) -> None:
+    """--backend."""
+    options.add_argument(
+        "--backend",
+        choices=BACKENDS,
+        default="torch",
+        help="library that runs the network; auto: the fastest that is installed "
+        "(default: %(default)s)",
     )
 
 

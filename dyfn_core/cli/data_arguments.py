@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from dyfn_core.cli.arguments import (
+    add_backend,
     add_device,
     add_max_frames,
     add_model,
@@ -40,3 +41,4 @@ def add_data_arguments(parser: argparse.ArgumentParser) -> None:
     add_model(group)
     add_num_tokens(group)
     add_device(group)
+    add_backend(group)

@@ -8,6 +8,7 @@ from pathlib import Path
 from dyfn_core.argument_types import above_zero, finite_above_zero, not_negative
 from dyfn_core.cli.arguments import (
     Options,
+    add_backend,
     add_controls,
     add_device,
     add_max_frames,
@@ -104,6 +105,7 @@ def add_run(command: argparse.ArgumentParser, given: Options | None = None) -> N
         "that are triangulated with its poses",
     )
     add_device(group)
+    add_backend(group)
 
 
 def add_predictions(command: argparse.ArgumentParser, given: Options | None = None) -> None:

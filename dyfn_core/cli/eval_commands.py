@@ -79,7 +79,7 @@ def _described(known: Benchmark) -> str:
 def _model(options: argparse.Namespace) -> Method:
     return ModelMethod(
         options.name or Path(options.model).stem,
-        load_model(options.model, options.device),
+        load_model(options.model, options.device, options.backend),
         stabilize=options.stabilize,
         controls=options.controls,
         num_tokens=options.num_tokens,

@@ -52,7 +52,9 @@ def run(options: argparse.Namespace) -> int:
     matcher = build_matcher(options.matcher)
     sequence = open_sequence(options)
     chosen = places(options, len(sequence))
-    model = load_model(options.model, options.device) if options.with_model else None
+    model = None
+    if options.with_model:
+        model = load_model(options.model, options.device, options.backend)
     found = reconstruct_sequence(
         sequence,
         tqdm(chosen, unit="frame", file=sys.stderr),

@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> int:
     sequence = open_sequence(options)
     chosen = places(options, len(sequence))
     spread = np.unique(np.linspace(0, len(chosen) - 1, options.frames).round().astype(int))
-    model = load_model(options.model, options.device)
+    model = load_model(options.model, options.device, options.backend)
     lost: list[str] = []
     frames = tqdm([chosen[i] for i in spread], unit="frame", file=sys.stderr)
     latents = _latents(model, sequence, frames, options.num_tokens, lost)

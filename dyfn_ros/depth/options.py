@@ -11,6 +11,7 @@ from typing import Any
 from dyfn_core.argument_types import above_zero, at_least_one, finite_above_zero, image_size
 from dyfn_core.cli.arguments import (
     Options,
+    add_backend,
     add_device,
     add_max_frames,
     add_model,
@@ -69,6 +70,7 @@ def parse(arguments: Sequence[str] | None = None) -> DepthJob:
         given["model"],
         given["device"],
         given["threads"],
+        given["backend"],
     )
 
 
@@ -106,6 +108,7 @@ def parser() -> argparse.ArgumentParser:
     group = made.add_argument_group("run", "what is run over the frames")
     add_model(group)
     add_device(group)
+    add_backend(group)
     add_threads(group)
     _add_writing(made.add_argument_group("outputs", "what is written and shown"))
     return made

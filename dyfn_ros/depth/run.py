@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from dyfn_core.models.export.backends import on_backend
 from dyfn_core.prediction import Frame, Prediction
 from dyfn_core.stream.session import StreamSession
 from dyfn_core.threads import computing_threads
@@ -111,7 +112,8 @@ def run(
     try:
         outputs = DepthOutputs(job.writing, source)
         _require_frame(source)
-        session = StreamSession(loader(job.model, job.device), job.stream)
+        model = on_backend(loader(job.model, job.device), job.backend)
+        session = StreamSession(model, job.stream)
         with computing_threads(job.threads), outputs:
             outcome = _frames(source, camera, session, outputs, stop, watch)
             outputs.finish(_facts(job, session, camera, outcome))

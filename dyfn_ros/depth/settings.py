@@ -90,6 +90,7 @@ class DepthJob:
     model: str = "dyfn-mini"
     device: str = "auto"
     threads: int = THREADS
+    backend: str = "torch"
 
 
 def parse_write(text: str) -> tuple[str, ...]:

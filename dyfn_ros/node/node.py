@@ -20,6 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_srvs.srv import Trigger
 
 from dyfn_core.models import load_model, resolve_device
+from dyfn_core.models.export.backends import kept_exports, on_backend
 from dyfn_core.stream.resets import RESET_SERVICE, TIME_JUMP
 from dyfn_core.stream.saving import StateError
 from dyfn_ros.node.camera import Camera, FrameJob
@@ -416,7 +417,7 @@ class StreamDepthNode(LifecycleNode):
         settings = self.settings
         if settings.threads:
             torch.set_num_threads(settings.threads)
-        model = self._load(settings.model, device)
+        model = on_backend(self._load(settings.model, device), settings.backend)
         cameras = [one for one, own in zip(self._cameras, devices, strict=True) if own == device]
         for camera in cameras:
             camera.open_stream(model)
@@ -426,7 +427,8 @@ class StreamDepthNode(LifecycleNode):
             unit = f"metres come from {', '.join(sorted(sources))}"
             if not sources:
                 unit = "depth is right up to one scale, which is not metres"
-            self.get_logger().info(f"{settings.model} on {device}; {unit}")
+            where = f"{device}, in {model.backend}" + kept_exports(model)
+            self.get_logger().info(f"{settings.model} on {where}; {unit}")
             if model.quantity == "disparity":
                 self.get_logger().warning(
                     f"{settings.model} predicts disparity, right up to scale and shift: the depth "

@@ -13,6 +13,7 @@ from typing import Any
 from dyfn_core.argument_types import above_zero, at_least_one, finite, finite_above_zero
 from dyfn_core.cli.arguments import (
     Options,
+    add_backend,
     add_controls,
     add_device,
     add_max_frames,
@@ -266,6 +267,7 @@ def _add_run(group: Options) -> None:
     add = group.add_argument
     add_model(group)
     add_device(group)
+    add_backend(group)
     add_threads(group)
     add(
         "--compare",

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dyfn_core.evaluation.sequence import SequenceEvaluation
 from dyfn_core.models.controls import latent_controls, stabilized_by
+from dyfn_core.models.export.backends import on_backend
 from dyfn_core.prediction import Prediction
 from dyfn_core.quantities import scored_quantity
 from dyfn_core.scoring.frame_scores import FrameScore
@@ -63,7 +64,7 @@ def replay(
     """
     reader = SourceReader(source)
     outputs.folder.mkdir(parents=True, exist_ok=True)
-    model = loader(run.model, run.device)
+    model = on_backend(loader(run.model, run.device), run.backend)
     stabilized = run.stream.stabilize and model.stabilizer is not None
     with computing_threads(run.threads) as threads:
         runner = _runner(reader, run, model)
@@ -90,7 +91,7 @@ def replay(
             evaluation.controls |= _controls(source, run, model, outputs)
     if run.load_state and (base is not None or run.controls):
         reader.warn("--load-state: base model and controls started without the saved state")
-    options = {**stream_facts(run), "threads": threads}
+    options = {**stream_facts(run), "backend": model.backend, "threads": threads}
     facts = runner.facts()
     doubts = reader.doubts(evaluation.scored_frames, outputs.depth_max)
     result = Result(

@@ -84,6 +84,7 @@ class Run:
     Attributes:
         model: Bundled name, checkpoint file or Hub id.
         device: "auto" (a GPU if there is one), "cpu", "cuda" or "cuda:N".
+        backend: Library that runs the network, see models.load_model.
         threads: CPU threads of inference; 0: torch's own choice.
         stream: The stream session's options.
         load_state: Go on from stream.state_file.
@@ -94,6 +95,7 @@ class Run:
 
     model: str = "dyfn-mini"
     device: str = "auto"
+    backend: str = "torch"
     threads: int = THREADS
     stream: SessionOptions = SessionOptions()
     load_state: bool = False

@@ -51,6 +51,12 @@ def on_backend(model: GeometryModel, backend: str) -> GeometryModel:
     return BackedModel(model, backend, runner_of(backend, model.device))
 
 
+def kept_exports(model: GeometryModel) -> str:
+    """Where the exported parts of a model are kept, for a log; "" for one without."""
+    keeps = model.backend not in (TORCH, "compile")
+    return f" (exported parts are kept in {export_folder()})" if keeps else ""
+
+
 def fastest(device: str) -> str:
     """The first of FASTEST that can be used here, else torch. device: its type."""
     for name in FASTEST.get(device, ()):

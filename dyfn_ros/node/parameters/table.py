@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+from dyfn_core.argument_types import BACKENDS
 from dyfn_core.stream.options import SCALE, STREAM, StreamOptions
 from dyfn_core.threads import THREADS
 from dyfn_ros.messages.odometry_options import OdometryOptions
@@ -54,6 +55,13 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         "Device that runs the model: auto (a GPU if there is one), cpu, cuda, cuda:N. Cameras of "
         "several devices have a model and a thread for each.",
         per_camera=True,
+    )
+    backend: str = _parameter(
+        _NODE,
+        "torch",
+        "Library that runs the network: torch, onnxruntime, openvino, tensorrt, compile; auto: the "
+        "fastest that is installed, which the log names.",
+        choices=BACKENDS,
     )
     threads: int = _parameter(
         _NODE,

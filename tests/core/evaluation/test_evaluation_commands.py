@@ -48,7 +48,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def pinhole_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(name: str, device: str) -> PinholeModel:
+    def load(name: str, device: str, backend: str) -> PinholeModel:
         return PinholeModel(stabilized=True).eval()
 
     monkeypatch.setattr(reconstruct, "load_model", load)

@@ -126,7 +126,7 @@ def test_metres_by_given_points_stand_beside_the_published_ones(
     folder = make_void(tmp_path / "release", 150, 6, scored=[1, 4])
     for index in range(6):
         write_slope(folder, index)
-    monkeypatch.setattr(eval_commands, "load_model", lambda name, device: PinholeModel().eval())
+    monkeypatch.setattr(eval_commands, "load_model", lambda *_: PinholeModel().eval())
     arguments = ["run", "--benchmark", "void-150", "--data", str(tmp_path / "release")]
     arguments += ["--model", "pinhole", "--metres-from", "points", "--no-controls"]
     arguments += ["--no-temporal", "--out", str(tmp_path / "out")]

@@ -63,7 +63,7 @@ def options_by_name() -> dict[str, argparse.Action]:
 
 
 def test_every_stream_parameter_of_the_node_is_an_option_with_its_default() -> None:
-    names = [*options_of(SessionOptions), "model", "device", "threads"]
+    names = [*options_of(SessionOptions), "model", "device", "backend", "threads"]
     assert set(names) <= SPECS.keys()
     job = parse(["walk", "--out", "out"]).job
     assert isinstance(job.run, Run)

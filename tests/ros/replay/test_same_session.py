@@ -206,6 +206,27 @@ def test_a_fixed_scale(session: Callable[..., Session]) -> None:
     assert [d.tobytes() for d in scaled] == offline
 
 
+def test_another_library(
+    session: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DYFN_EXPORTS", str(tmp_path / "exports"))
+    bench = session(backend="onnxruntime")
+    sent = images([10, 11, 12, 13], frames(4, seed=3))
+    live = bench.live(sent)
+    made = sorted(path.name for path in (tmp_path / "exports").iterdir())
+    offline, metrics = bench.replay(sent)
+    assert live == offline
+    assert metrics["options"]["backend"] == "onnxruntime"
+    assert [name.split("-")[1] for name in made] == ["decode", "encode", "stabilize"]
+    assert made == sorted(path.name for path in (tmp_path / "exports").iterdir())
+    bench.options = {}
+    exact, metrics = bench.replay(sent)
+    assert metrics["options"]["backend"] == "torch"
+    for one, other in zip(exact, offline, strict=True):
+        one, other = np.frombuffer(one, np.float32), np.frombuffer(other, np.float32)
+        np.testing.assert_allclose(other, one, rtol=1e-4)
+
+
 def relative(
     bench: Session, seconds: list[int], pictures: list[np.ndarray]
 ) -> Iterator[np.ndarray]:
