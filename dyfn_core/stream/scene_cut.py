@@ -77,8 +77,7 @@ def structure_difference(before: PictureFeatures, now: PictureFeatures) -> float
     shown = before.texture > _TEXTURE
     if shown.sum() < _FEWEST:
         return math.nan
-    blocks = _windows(before.opponent)[:: BLOCK[1], :: BLOCK[0]]
-    blocks = blocks.reshape(len(shown), -1)[shown]
+    blocks = _windows(before.opponent, BLOCK).reshape(len(shown), -1)[shown]
     windows = _windows(now.opponent)
     found = (windows.reshape(-1, windows.shape[-1]) @ blocks.T).reshape(*windows.shape[:2], -1)
     found = cv2.dilate(found, np.ones((SLACK, SLACK), np.uint8)).reshape(found.shape)
@@ -95,9 +94,11 @@ def structure_difference(before: PictureFeatures, now: PictureFeatures) -> float
     return float(1 - score.max())
 
 
-def _windows(picture: np.ndarray) -> np.ndarray:
-    """Every block-sized window, without its mean colour and of unit length: y x x x values."""
+def _windows(picture: np.ndarray, step: tuple[int, int] = (1, 1)) -> np.ndarray:
+    """Block-sized windows, `step` apart across and down, without their mean colour and of unit
+    length: y x x x values."""
     views = np.lib.stride_tricks.sliding_window_view(picture, (BLOCK[1], BLOCK[0]), axis=(0, 1))
+    views = views[:: step[1], :: step[0]]
     flat = views.reshape(*views.shape[:3], -1)
     flat = flat - flat.mean(axis=-1, keepdims=True)
     flat = flat.reshape(*flat.shape[:2], -1)

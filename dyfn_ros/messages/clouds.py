@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import array
 from typing import Any
 
+import cv2
 import numpy as np
 
 from dyfn_ros.messages.encodings import MessageError
@@ -11,67 +13,119 @@ from dyfn_ros.messages.images import _bytes, _ros_bytes
 
 # PCL's PointXYZRGB: colour at 16, so that x y z keep four floats to themselves.
 CLOUD_OFFSETS = {"x": 0, "y": 4, "z": 8, "rgb": 16}
-
-
 CLOUD_STEP = 32
 
 
-CLOUD_DTYPE = np.dtype(
-    {
-        "names": list(CLOUD_OFFSETS),
-        "formats": ["<f4"] * 4,
-        "offsets": list(CLOUD_OFFSETS.values()),
-        "itemsize": CLOUD_STEP,
-    }
-)
+def _layout(offsets: dict[str, int], step: int) -> np.dtype[np.void]:
+    return np.dtype(
+        {
+            "names": list(offsets),
+            "formats": ["<f4"] * 4,
+            "offsets": list(offsets.values()),
+            "itemsize": step,
+        }
+    )
 
 
+CLOUD_DTYPE = _layout(CLOUD_OFFSETS, CLOUD_STEP)
+COMPACT_DTYPE = _layout({**CLOUD_OFFSETS, "rgb": 12}, 16)
 _FLOAT32 = 7  # sensor_msgs/PointField
 
 
-def pack_cloud(points: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Organised cloud: H x W of CLOUD_DTYPE.
+class CloudMemory:
+    """Memory for clouds, one after the other: fresh pages for each cost more than the points.
+
+    A cloud is good until the next one is packed into the same memory.
+    """
+
+    def __init__(self) -> None:
+        self.data = array.array("B")
+        self._cloud: np.ndarray = np.empty((0, 0), CLOUD_DTYPE)
+
+    def cloud(self, shape: tuple[int, ...], dtype: np.dtype[np.void]) -> np.ndarray:
+        """H x W of dtype, whose padding is zero and whose points are those of the cloud before."""
+        if self._cloud.shape != shape or self._cloud.dtype != dtype:
+            self.data = array.array("B", bytes(dtype.itemsize * shape[0] * shape[1]))
+            self._cloud = _bytes(self.data).view(dtype).reshape(shape)
+        return self._cloud
+
+
+def pack_cloud(
+    points: np.ndarray,
+    valid: np.ndarray,
+    image: np.ndarray,
+    dtype: np.dtype[np.void] = CLOUD_DTYPE,
+    memory: CloudMemory | None = None,
+) -> np.ndarray:
+    """Organised cloud: H x W of dtype.
 
     points: H x W x 3, optical frame. valid: H x W bool; the others become NaN.
     image: H x W x 3 uint8 RGB, packed as 0x00RRGGBB into the bits of a float.
+    memory: where to; None: memory of its own.
     """
-    cloud = np.zeros(valid.shape, CLOUD_DTYPE)
-    for i, axis in enumerate("xyz"):
-        cloud[axis] = np.where(valid, points[..., i], np.nan)
-    red, green, blue = (image[..., i].astype(np.uint32) for i in range(3))
-    cloud["rgb"] = ((red << 16) | (green << 8) | blue).astype("<u4").view("<f4")
+    cloud = (memory or CloudMemory()).cloud(valid.shape, dtype)
+    if not cloud.size:
+        return cloud
+    step, colour = dtype.itemsize, dtype.fields["rgb"][1]  # type: ignore[index]
+    octets = cloud.view(np.uint8).reshape(*valid.shape, step)
+    floats = octets.view("<f4")
+    xyz = np.ascontiguousarray(points, "<f4")
+    rgb = np.ascontiguousarray(image)
+    cv2.mixChannels([xyz], [floats], [0, 0, 1, 1, 2, 2])
+    cv2.mixChannels([rgb], [octets], [0, colour + 2, 1, colour + 1, 2, colour])
+    invalid = np.flatnonzero(~valid)
+    if invalid.size:
+        floats.reshape(-1, step // 4)[invalid, :3] = np.nan
     return cloud
 
 
 def cloud_points(message: Any) -> np.ndarray:
-    """An organised PointCloud2 of ours -> height x width array of CLOUD_DTYPE.
+    """An organised PointCloud2 of ours -> height x width of CLOUD_DTYPE or COMPACT_DTYPE.
 
     Raises MessageError when the layout is another one.
     """
     layout = [(f.name, int(f.offset), int(f.datatype)) for f in message.fields]
-    expected = [(name, offset, _FLOAT32) for name, offset in CLOUD_OFFSETS.items()]
-    if layout != expected or message.point_step != CLOUD_STEP or message.is_bigendian:
-        raise MessageError(f"cloud layout {layout}, step {message.point_step}; expected {expected}")
+    found = [
+        dtype
+        for dtype in (CLOUD_DTYPE, COMPACT_DTYPE)
+        if layout == _fields(dtype) and message.point_step == dtype.itemsize
+    ]
+    if not found or message.is_bigendian:
+        raise MessageError(
+            f"cloud layout {layout}, step {message.point_step}; expected {_fields(CLOUD_DTYPE)} "
+            f"and {CLOUD_DTYPE.itemsize}, or {_fields(COMPACT_DTYPE)} and {COMPACT_DTYPE.itemsize}"
+        )
+    (dtype,), step = found, found[0].itemsize
     height, width = int(message.height), int(message.width)
     data = _bytes(message.data)
-    if message.row_step != CLOUD_STEP * width or data.size != CLOUD_STEP * width * height:
+    if message.row_step != step * width or data.size != step * width * height:
         raise MessageError(f"cloud of {width} x {height} points has {data.size} bytes")
-    return data.view(CLOUD_DTYPE).reshape(height, width)
+    return data.view(dtype).reshape(height, width)
 
 
-def cloud_message(header: Any, cloud: np.ndarray) -> Any:
-    """H x W of CLOUD_DTYPE -> sensor_msgs.msg.PointCloud2; header as it is."""
+def _fields(dtype: np.dtype[np.void]) -> list[tuple[str, int, int]]:
+    assert dtype.fields is not None
+    return [(name, offset, _FLOAT32) for name, (_, offset, *_) in dtype.fields.items()]
+
+
+def cloud_message(header: Any, cloud: np.ndarray, memory: CloudMemory | None = None) -> Any:
+    """-> sensor_msgs.msg.PointCloud2; header as it is.
+
+    cloud: as pack_cloud returns it. memory: that it was packed into; the message then has no copy,
+    and is good as long as the cloud.
+    """
     from sensor_msgs.msg import PointCloud2, PointField
 
     height, width = cloud.shape
+    step = cloud.dtype.itemsize
     fields = [
-        PointField(name=name, offset=offset, datatype=_FLOAT32, count=1)
-        for name, offset in CLOUD_OFFSETS.items()
+        PointField(name=name, offset=offset, datatype=kind, count=1)
+        for name, offset, kind in _fields(cloud.dtype)
     ]
     message = PointCloud2(header=header, height=height, width=width, fields=fields)
-    message.point_step = CLOUD_STEP
-    message.row_step = CLOUD_STEP * width
+    message.point_step = step
+    message.row_step = step * width
     message.is_bigendian = False
     message.is_dense = False
-    message.data = _ros_bytes(cloud)
+    message.data = _ros_bytes(cloud) if memory is None else memory.data
     return message

@@ -16,7 +16,13 @@ from dyfn_core.evaluation.report.colours import colour_depth, depth_range
 from dyfn_core.geometry.edges import flying_pixels
 from dyfn_core.prediction import Prediction
 from dyfn_ros.messages.camera_info import camera_info_message
-from dyfn_ros.messages.clouds import cloud_message, pack_cloud
+from dyfn_ros.messages.clouds import (
+    CLOUD_DTYPE,
+    COMPACT_DTYPE,
+    CloudMemory,
+    cloud_message,
+    pack_cloud,
+)
 from dyfn_ros.messages.compressed_depth import FARTHEST, encode_compressed_depth
 from dyfn_ros.messages.images import (
     colour_message,
@@ -61,6 +67,7 @@ class NodeOutputs:
         self._valid_ratio = ports.publisher(Float32, f"~/{prefix}valid_ratio", QoSProfile(depth=10))
         self._colored = advertise(Image, "depth/colored")
         self._points = advertise(PointCloud2, "points")
+        self._cloud_memory = CloudMemory()
         self._normal: Any = None
         self._advertise = advertise
         self._resets = ports.publisher(DiagnosticArray, f"~/{prefix}resets", latched)
@@ -108,8 +115,9 @@ class NodeOutputs:
             painted = self._colours.paint(np.where(valid, depth, np.nan))
             self._colored.publish(colour_message(header, painted))
         if settings.publish_points and self._points.get_subscription_count():
-            cloud = filtered_cloud(prediction, valid, image, settings)
-            self._points.publish(cloud_message(header, cloud))
+            memory = self._cloud_memory
+            cloud = filtered_cloud(prediction, valid, image, settings, memory)
+            self._points.publish(cloud_message(header, cloud, memory))
         if prediction.normal is not None and self.wants_normals(settings):
             self._normal.publish(normal_message(header, prediction.normal, valid))
         return share
@@ -143,9 +151,13 @@ class ColourScale:
 
 
 def filtered_cloud(
-    prediction: Prediction[np.ndarray], valid: np.ndarray, image: np.ndarray, settings: NodeSettings
+    prediction: Prediction[np.ndarray],
+    valid: np.ndarray,
+    image: np.ndarray,
+    settings: NodeSettings,
+    memory: CloudMemory,
 ) -> np.ndarray:
-    """The cloud that the points_... settings ask for: h x w of CLOUD_DTYPE.
+    """The cloud that the points_... settings ask for: h x w of CLOUD_DTYPE or COMPACT_DTYPE.
 
     Range and edges are judged at full resolution; the stride then takes the middle pixel of each
     block.
@@ -156,7 +168,8 @@ def filtered_cloud(
     stride = settings.points_stride
     first = (min(stride, *valid.shape) - 1) // 2
     grid = (slice(first, None, stride),) * 2
-    return pack_cloud(prediction.points[grid], valid[grid], image[grid])
+    dtype = COMPACT_DTYPE if settings.points_compact else CLOUD_DTYPE
+    return pack_cloud(prediction.points[grid], valid[grid], image[grid], dtype, memory)
 
 
 def in_range(depth: np.ndarray, valid: np.ndarray, near: float, far: float) -> np.ndarray:

@@ -233,6 +233,14 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
         per_camera=True,
         range=(1, 64),
     )
+    points_compact: bool = _parameter(
+        _CLOUD,
+        False,
+        "16 bytes a point (x y z rgb) instead of the 32 of PCL's PointXYZRGB: half the memory and "
+        "bandwidth.",
+        changes=RUN,
+        per_camera=True,
+    )
     points_min_depth: float = _parameter(
         _CLOUD,
         0.0,

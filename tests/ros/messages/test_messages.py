@@ -23,7 +23,14 @@ from std_msgs.msg import Header
 from dyfn_core.geometry.camera import valid_depth
 from dyfn_ros.messages import images as messages
 from dyfn_ros.messages.camera_info import camera_info_message, decode_camera_info
-from dyfn_ros.messages.clouds import CLOUD_DTYPE, cloud_message, cloud_points, pack_cloud
+from dyfn_ros.messages.clouds import (
+    CLOUD_DTYPE,
+    COMPACT_DTYPE,
+    CloudMemory,
+    cloud_message,
+    cloud_points,
+    pack_cloud,
+)
 from dyfn_ros.messages.compressed_image import Layout, decode_compressed, parse_format
 from dyfn_ros.messages.images import MessageError
 from dyfn_ros.messages.jpeg_complaints import with_complaints
@@ -352,6 +359,35 @@ def test_cloud_survives_the_round_trip_bit_for_bit() -> None:
     )
     back = cloud_points(cloud_message(header(), cloud))
     assert back.tobytes() == cloud.tobytes()
+
+
+def test_a_compact_cloud_has_the_same_values_in_half_the_bytes() -> None:
+    rng = np.random.default_rng(1)
+    arrays = (
+        rng.normal(size=(5, 7, 3)).astype(np.float32),
+        rng.random((5, 7)) < 0.7,
+        rng.integers(0, 256, (5, 7, 3)).astype(np.uint8),
+    )
+    message = cloud_message(header(), pack_cloud(*arrays, COMPACT_DTYPE))
+    assert (message.point_step, message.row_step, len(message.data)) == (16, 112, 560)
+    assert [(f.name, f.offset) for f in message.fields][3] == ("rgb", 12)
+    compact, padded = cloud_points(message), pack_cloud(*arrays)
+    for name in CLOUD_DTYPE.names:
+        assert compact[name].tobytes() == padded[name].tobytes(), name
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (3, 4), (0, 0)])
+def test_memory_that_held_another_cloud_leaves_nothing_of_it(shape: tuple[int, int]) -> None:
+    memory = CloudMemory()
+    for seed, dtype in enumerate((COMPACT_DTYPE, CLOUD_DTYPE, CLOUD_DTYPE)):
+        rng = np.random.default_rng(seed)
+        points = rng.normal(size=(*shape, 3)).astype(np.float32)
+        valid = rng.random(shape) < 0.5
+        image = rng.integers(0, 256, (*shape, 3)).astype(np.uint8)
+        cloud = pack_cloud(points, valid, image, dtype, memory)
+        assert cloud.tobytes() == pack_cloud(points, valid, image, dtype).tobytes()
+        message = cloud_message(header(), cloud, memory)
+        assert bytes(message.data) == cloud.tobytes()
 
 
 def test_clouds_of_another_layout_are_refused() -> None:
