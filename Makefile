@@ -26,9 +26,10 @@ test: $(READY)
 test-fast: $(READY)
 	$(BIN)/python -m pytest -m "not slow"
 
-# Does every fault of docs/faults.md to the node, and writes what came of it there.
+# Does every fault of docs/faults.md to the node, writes what came of it there, and fuzzes every topic.
 faults: $(READY)
 	$(BIN)/python -m tests.support.faults.table --write
+	DYFN_FUZZ=2000 $(BIN)/python -m pytest tests/ros/node/test_fuzz.py
 
 coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term

@@ -124,11 +124,11 @@ def use_tf_stand_in() -> None:
 
 def tf_topic(transform: TransformStamped) -> Any:
     """What a publisher of /tf sends to such a node."""
-    if find_spec("tf2_msgs") is None:
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
         return transform
-    from tf2_msgs.msg import TFMessage
-
-    return TFMessage(transforms=[transform])
+    return transform if TFMessage is TransformStamped else TFMessage(transforms=[transform])
 
 
 def tf_message(*transforms: TransformStamped) -> Any:

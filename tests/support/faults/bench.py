@@ -270,7 +270,8 @@ def faulty_bench(
         "diagnostics_period": 0.05,
     }
     for camera in cameras:
-        values.update({f"{camera}.{name}": value for name, value in CAMERAS[camera].items()})
+        own = CAMERAS.get(camera, {})
+        values.update({f"{camera}.{name}": value for name, value in own.items()})
     values.update(parameters)
     arguments = [part for name, value in values.items() for part in ("-p", f"{name}:={value}")]
     probe = Probe(domain)
