@@ -223,7 +223,20 @@ class DyFNRunConfig(RunConfig):
     def _fits(self) -> DyFNRunConfig:
         if self.warm_start and self.dyfn:
             raise ValueError("warm_start keeps the base's DyFN: remove the `dyfn` settings")
+        objective = getattr(self.method, "objective", None)
+        if isinstance(objective, PaperObjective):
+            self._check_levels(objective.objective())
         return self
+
+    def _check_levels(self, objective: Objective) -> None:
+        for height, width in {size for stage in self.stages for size in stage.sizes}:
+            try:
+                objective.check_size((height // 2, width // 2))
+            except ValueError as error:
+                raise ValueError(
+                    f"stages.sizes [{height}, {width}]: the losses are computed at half of it. "
+                    f"{error}. Or leave that level out of method.objective.levels"
+                ) from error
 
 
 def _check_lengths(length: int, cache_length: int, strides: tuple[int, int]) -> None:

@@ -14,7 +14,9 @@ from dyfn_core.losses.resample import nearest_valid
 from dyfn_core.losses.target import Target
 
 TRUNC = 1.0
-FEWEST = 32  # balls with fewer valid pixels are dropped
+FEWEST = 32  # balls with fewer valid pixels are dropped by the released code
+LEAST = 8  # and by the rule for small images; an alignment has four unknowns
+FULL = 3  # that rule: a ball has a third of the pixels of a disc that faces the camera
 NEIGHBOURS = 64
 SCALE_RANGE = 10.0  # a ball's scale lies within this factor of the frame's
 
@@ -27,15 +29,64 @@ class LocalLevel:
         alpha: Radius of the balls relative to what the image spans at their depth.
         anchors: Balls per frame.
         resolution: A ball is aligned on resolution x resolution samples.
+        fewest: Balls of fewer valid pixels are dropped. None goes by the image's size: a third of
+            the pixels that a ball facing the camera has, between 8 and 32. The released code has
+            32, which only images of half a megapixel have in balls of alpha 1/64.
     """
 
     alpha: float
     anchors: int
     resolution: int
+    fewest: int | None = None
+
+    def fewest_at(self, size: tuple[int, int]) -> int:
+        """Find how many valid pixels a ball must have.
+
+        Args:
+            size: Height and width of the image in pixels.
+
+        Returns:
+            The number of pixels.
+        """
+        if self.fewest is not None:
+            return self.fewest
+        disc = math.pi * (0.5 * self.alpha * math.hypot(*size)) ** 2
+        return min(FEWEST, max(LEAST, math.ceil(disc / FULL)))
+
+    def check_size(self, size: tuple[int, int]) -> None:
+        """Refuse images in which no ball has enough pixels.
+
+        Args:
+            size: Height and width of the image in pixels.
+
+        Raises:
+            ValueError: Names the smallest size of that aspect.
+        """
+        needed = self.fewest_at(size)
+        if _pixels_within(0.5 * self.alpha * math.hypot(*size)) >= needed:
+            return
+        radius = next(r for r in (n**0.5 for n in range(1, 10_000)) if _pixels_within(r) >= needed)
+        factor = 2 * radius / self.alpha / math.hypot(*size)
+        raise ValueError(
+            f"L_local of alpha 1/{1 / self.alpha:g}: no ball of an image of {size[0]} x {size[1]} "
+            f"has {needed} pixels; the smallest image of that shape is "
+            f"{math.ceil(size[0] * factor)} x {math.ceil(size[1] * factor)}"
+        )
 
 
-# The paper's text; the released training configuration has an alpha of 1/64 in the last.
 TEXT_LEVELS = (LocalLevel(1 / 4, 16, 16), LocalLevel(1 / 16, 256, 8), LocalLevel(1 / 32, 4096, 4))
+RELEASED_LEVELS = (
+    LocalLevel(1 / 4, 16, 16, FEWEST),
+    LocalLevel(1 / 16, 256, 8, FEWEST),
+    LocalLevel(1 / 64, 4096, 4, FEWEST),
+)
+
+
+def _pixels_within(radius: float) -> int:
+    """How many pixels have their centre within a radius of a pixel's, in pixels."""
+    reach = math.floor(radius)
+    steps = range(-reach, reach + 1)
+    return sum(row * row + col * col <= radius * radius + 1e-9 for row in steps for col in steps)
 
 
 def square_radius(alpha: float, size: tuple[int, int]) -> int:
@@ -88,9 +139,14 @@ def anchor_chance(target: Target, alpha: float, offsets: Tensor | None = None) -
     cols = torch.arange(width, device=offsets.device)[None, :, None] + offsets[1]
     inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
     rows, cols = rows.clamp(0, height - 1), cols.clamp(0, width - 1)
-    near = target.points[:, rows, cols] - target.points[..., None, :]
-    near = near.norm(dim=-1) <= ball_radius(target, alpha)[..., None]
-    count = (near & inside & target.valid[:, rows, cols]).float().sum(-1)
+    index = (rows * width + cols).flatten()
+    apart = torch.zeros(len(target.valid), *rows.shape, device=rows.device)
+    for axis in target.points.unbind(-1):
+        step = axis.flatten(1)[:, index].view_as(apart) - axis[..., None]
+        apart = torch.addcmul(apart, step, step)
+    near = apart <= ball_radius(target, alpha)[..., None].square()
+    valid = target.valid.flatten(1)[:, index].view_as(near)
+    count = (near & inside & valid).float().sum(-1)
     chance = torch.where(target.valid, 1 / count.clamp(min=1), 0.0)
     return chance / chance.sum((-2, -1), keepdim=True).add(1e-7)
 
@@ -125,9 +181,9 @@ def local_loss(
     """L_local = sum_a mean_i (1 / z*_i) |s_a p_i + t_a - p*_i|_1 / anchors (paper section 4; MoGe).
 
     The ball of anchor a holds every valid pixel i of the square around it whose true point is
-    within the ball's radius; balls of fewer than FEWEST pixels are dropped. s_a and t_a, along all
-    three axes, minimise the ball's truncated error and are detached. The mean is over the square
-    and the three coordinates.
+    within the ball's radius; balls of fewer than `level.fewest` pixels are dropped. s_a and t_a,
+    along all three axes, minimise the ball's truncated error and are detached. The mean is over the
+    square and the three coordinates.
 
     Args:
         points: Predicted points, B x H x W x 3.
@@ -197,7 +253,7 @@ def _balls(target: Target, level: LocalLevel, frame: Tensor, centre: Tensor) -> 
     apart = points[frame[:, None], index] - points[frame, centre][:, None]
     inside = inside & target.valid.flatten(1)[frame[:, None], index]
     inside = inside & (apart.norm(dim=-1) <= radius[:, None])
-    kept = inside.sum(-1) >= FEWEST
+    kept = inside.sum(-1) >= level.fewest_at((height, width))
     return _Balls(frame[kept], radius[kept], len(offsets), index[kept], inside[kept])
 
 

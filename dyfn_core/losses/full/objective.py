@@ -11,25 +11,28 @@ from torch import Tensor
 
 from dyfn_core.losses.clip_alignment import clip_alignment_loss
 from dyfn_core.losses.full.clip_alignment import align_clips
-from dyfn_core.losses.full.local import TEXT_LEVELS, LocalLevel, local_loss
+from dyfn_core.losses.full.local import RELEASED_LEVELS, TEXT_LEVELS, LocalLevel, local_loss
 from dyfn_core.losses.full.mask import mask_loss
 from dyfn_core.losses.full.normal import edge_loss, normal_loss
 from dyfn_core.losses.full.temporal import FORMS, temporal_loss
 from dyfn_core.losses.full.whole_frame import align_frames, global_loss
 from dyfn_core.losses.target import ClipTarget
 
+# Where the released training code differs from the text, beside the form of its terms.
+RELEASED: dict[str, Any] = {"frame": 1.0, "levels": RELEASED_LEVELS, "windows": (1, 2, 4, 8)}
+
 
 @dataclass(frozen=True)
 class Objective:
     """L = L_MoGe + 1.0 L_align + 0.1 L_temp (paper section 4).
 
-    L_MoGe = L_local + L_normal + L_mask, and the released code's L_global. A term of weight 0 is
-    not computed.
+    L_MoGe = L_local + L_normal + L_mask. The released code keeps MoGe's L_global besides
+    (RELEASED). A term of weight 0 is not computed.
 
     Attributes:
         align_first: Weight of L_align under the alignment of the first frame.
         align_all: Weight of L_align under the alignment of all frames.
-        frame: Weight of MoGe's per-frame global term.
+        frame: Weight of MoGe's per-frame global term, which the paper's text does not have.
         local: Weight of L_local, of each level.
         normal: Weight of L_normal.
         mask: Weight of L_mask.
@@ -46,7 +49,7 @@ class Objective:
 
     align_first: float = 1.0
     align_all: float = 0.0
-    frame: float = 1.0
+    frame: float = 0.0
     local: float = 1.0
     normal: float = 1.0
     mask: float = 1.0
@@ -67,7 +70,8 @@ class Objective:
         """Make an objective from plain values.
 
         Args:
-            values: Fields of Objective; `levels` may be mappings of LocalLevel's fields.
+            values: Fields of Objective; `levels` may be mappings of LocalLevel's fields. With form
+                "released", absent ones are those of RELEASED.
 
         Returns:
             The objective.
@@ -84,7 +88,19 @@ class Objective:
                 level if isinstance(level, LocalLevel) else LocalLevel(**level)
                 for level in plain["levels"]
             )
-        return Objective(**plain)
+        return Objective(**(RELEASED if plain.get("form") == "released" else {}) | plain)
+
+    def check_size(self, size: tuple[int, int]) -> None:
+        """Refuse images too small for the levels of L_local.
+
+        Args:
+            size: Height and width that the losses are computed at, in pixels.
+
+        Raises:
+            ValueError: Names the level and the smallest size.
+        """
+        for level in self.levels if self.local > 0 else ():
+            level.check_size(size)
 
     def weights(self) -> dict[str, float]:
         """Weight of each term that counts, by name; local levels are "local_0", "local_1", ..."""
@@ -115,17 +131,19 @@ class Objective:
         flat, frames = points.flatten(0, 1), target.frames
         wanted = self.weights()
         terms = {}
-        first = None
+        own = first = None
+        if "frame" in wanted or (self.local > 0 and self.levels):
+            own = align_frames(flat, frames, self.resolution)
         if {"align_first", "temporal"} & set(wanted):
-            first = align_clips(points, target, "first", self.resolution)
+            if own is None:
+                first = align_clips(points, target, "first", self.resolution)
+            else:  # the first frame's own alignment
+                first = own[0][:: target.length], own[1][:: target.length]
         if first is not None and "align_first" in wanted:
             terms["align_first"] = self._clips(points, target, *first)
         if "align_all" in wanted:
             every = align_clips(points, target, "all", self.all_resolution)
             terms["align_all"] = self._clips(points, target, *every)
-        own = None
-        if "frame" in wanted or (self.local > 0 and self.levels):
-            own = align_frames(flat, frames, self.resolution)
         if own is not None and "frame" in wanted:
             terms["frame"] = global_loss(flat, frames, *own).mean()
         if own is not None and self.local > 0:

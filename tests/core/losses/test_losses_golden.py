@@ -23,7 +23,7 @@ from torch import Tensor
 from dyfn_core.geometry.alignment import truncated_error
 from dyfn_core.losses.full.clip_alignment import align_clips
 from dyfn_core.losses.full.local import (
-    TEXT_LEVELS,
+    FEWEST,
     LocalLevel,
     anchor_chance,
     draw_anchors,
@@ -32,16 +32,13 @@ from dyfn_core.losses.full.local import (
 )
 from dyfn_core.losses.full.mask import mask_loss
 from dyfn_core.losses.full.normal import edge_loss, normal_loss
-from dyfn_core.losses.full.objective import Objective
+from dyfn_core.losses.full.objective import RELEASED, Objective
 from dyfn_core.losses.full.temporal import temporal_loss
 from dyfn_core.losses.full.whole_frame import align_frames, global_loss
 from dyfn_core.losses.resample import nearest_valid, pick
 from dyfn_core.losses.target import ClipTarget, Target
 from dyfn_core.models.moge import remap_points
 
-# What the released training configuration sets otherwise than the paper's text.
-RELEASED_LEVELS = (*TEXT_LEVELS[:2], LocalLevel(1 / 64, 4096, 4))
-RELEASED_WINDOWS = (1, 2, 4, 8)
 SCENES = ("t4_32x40", "t12_32x40", "t1_96x128", "t1_288x384")
 NOT_COMPARED = re.compile(
     r"gram_anchoring_loss|monitoring|align_affine_lstsq|align_depth_affine_irls|/scene$"
@@ -254,7 +251,9 @@ def local_case(golden: Path, case: str) -> tuple[LocalLevel, Tensor, Target, Ten
     options = arguments(golden)[case]
     points, target = scene(golden, f"{case.split('/')[0]}/scene")
     index = int(re.search(r"frame(\d+)", case)[1])  # type: ignore[index]
-    level = LocalLevel(1 / options["level"], options["num_patches"], options["align_resolution"])
+    level = LocalLevel(
+        1 / options["level"], options["num_patches"], options["align_resolution"], FEWEST
+    )
     one = frame(target, index)
     focal = tensor(golden, f"{case}/in/focal")
     torch.testing.assert_close(one.focal[0], focal)
@@ -304,7 +303,7 @@ def test_motion_vectors(golden_losses: Path) -> None:
         scale = tensor(golden_losses, f"{case}/in/scale")[None]
         own = points[None].clone().requires_grad_()
         loss = temporal_loss(
-            own, ClipTarget(target, len(points)), scale, RELEASED_WINDOWS, "released"
+            own, ClipTarget(target, len(points)), scale, RELEASED["windows"], "released"
         )
         wanted = tensor(golden_losses, f"{case}/out/loss")
         if torch.isnan(wanted):  # the released code on a clip too short for its windows
@@ -329,14 +328,17 @@ def test_whole_training_step(golden_losses: Path) -> None:
     for name in ("patch_4", "patch_16", "patch_64"):
         parameters = levels[name]["params"]
         level = LocalLevel(
-            1 / parameters["level"], parameters["num_patches"], parameters["align_resolution"]
+            1 / parameters["level"],
+            parameters["num_patches"],
+            parameters["align_resolution"],
+            FEWEST,
         )
         drawn = [
             tensor(golden_losses, f"{case}/anchors/frame{i}_{name}/in/ij").long() for i in range(9)
         ]
         anchors[level] = torch.stack([ij[:, 0] * 64 + ij[:, 1] for ij in drawn])
     own = points[None].clone().requires_grad_()
-    objective = Objective(form="released", levels=RELEASED_LEVELS, windows=RELEASED_WINDOWS)
+    objective = Objective.from_dict({"form": "released"})
     terms = objective.terms(own, mask[None], ClipTarget(target, 9), anchors)
     wanted = tensor(golden_losses, f"{case}/out/loss_terms_per_frame").float()
     names = ("align_first", "frame", "local_0", "local_1", "local_2", "normal", "mask")

@@ -62,6 +62,21 @@ def test_what_cannot_be_used_is_named(path: Path, setting: str, told: str) -> No
     assert told in refused(path, setting)
 
 
+def test_images_too_small_for_a_level_are_refused_by_name() -> None:
+    paper = "method.objective={kind: paper}"
+    read_config(UNROLLED, DyFNRunConfig, [paper])  # 128 x 160 and more
+    small = "stages=[{from_step: 0, batch: 1, sizes: [[96, 128]]}]"
+    told = refused(UNROLLED, paper, small)
+    assert "stages.sizes [96, 128]: the losses are computed at half of it" in told
+    assert "L_local of alpha 1/32: no ball of an image of 48 x 64 has 8 pixels" in told
+    assert "the smallest image of that shape is 55 x 73" in told
+    fewer = "method.objective={kind: paper, levels: [{alpha: 0.25, anchors: 16, resolution: 16}]}"
+    read_config(UNROLLED, DyFNRunConfig, [fewer, small])
+    released = refused(UNROLLED, "method.objective={kind: paper, form: released}")
+    assert "alpha 1/64" in released
+    assert "has 32 pixels" in released
+
+
 def test_cache_settings_need_a_cache() -> None:
     told = refused(UNROLLED, "method.cache_draws=0", "method.cache=x", "method.cache_seed=1")
     assert "cache and cache_seed without effect: cache_draws is 0" in told
