@@ -12,15 +12,23 @@ from dyfn_ros.recordings.open import open_recording
 from dyfn_ros.recordings.writer import RecordingWriter
 from tests.support.odometry import MOUNT, SECOND, odometry
 from tests.support.pinhole import FOV_X
-from tests.support.textured_plane import CAMERA, SIZE, plane_view, texture, walk
+from tests.support.textured_plane import CAMERA, SIZE, PlaneView, plane_view, texture, walk
 
 UNIT = 3.0  # metres in one unit of the model
 FOCAL = SIZE[1] / 2 / np.tan(np.radians(FOV_X / 2))
 OWN_CAMERA = np.array([[FOCAL, 0, CAMERA[0, 2]], [0, FOCAL, CAMERA[1, 2]], [0, 0, 1]])
 
 
+def shown(view: PlaneView) -> np.ndarray:
+    """H x W x 3 uint8 RGB: red says the depth to PinholeModel, green has the texture."""
+    image = np.zeros((*SIZE, 3), np.uint8)
+    image[..., 0] = np.round((view.depth / UNIT - 0.5) * 255)
+    image[..., 1] = view.image[..., 1]
+    return image
+
+
 def plane_folder(path: Path) -> Path:
-    """60 frames at 10 Hz; red says the depth to PinholeModel, green has the texture."""
+    """60 frames at 10 Hz, see `shown`."""
     whole = texture()
     for name in ("rgb", "depth"):
         (path / name).mkdir(parents=True)
@@ -29,9 +37,7 @@ def plane_folder(path: Path) -> Path:
     np.savetxt(path / "poses.txt", np.stack(poses).reshape(-1, 16))
     for index, pose in enumerate(poses):
         view = plane_view(pose, whole, OWN_CAMERA)
-        image = np.zeros((*SIZE, 3), np.uint8)
-        image[..., 2] = np.round((view.depth / UNIT - 0.5) * 255)
-        image[..., 1] = view.image[..., 1]
+        image = shown(view)[..., ::-1]
         cv2.imwrite(str(path / "rgb" / f"{index:05d}.png"), image)
         depth = np.round(view.depth * 1000).astype(np.uint16)
         cv2.imwrite(str(path / "depth" / f"{index:05d}.png"), depth)

@@ -13,10 +13,15 @@ from rclpy.qos import QoSCompatibility, qos_check_compatible, qos_profile_sensor
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2, PointField
 
+from dyfn_core.geometry.rigid import inverse
+from dyfn_ros.messages.camera_info import camera_info_message
 from dyfn_ros.messages.clouds import cloud_points
 from dyfn_ros.messages.transforms import TransformBuffer
 from tests.support.foreign_parameters import NAV2_COSTMAP, NAV2_SOURCE, NAV2_VOXEL_LAYER
-from tests.support.odometry import pose_text, tf_message, transform
+from tests.support.node_here import running_node
+from tests.support.odometry import odometry, pose_text, tf_message, transform
+from tests.support.plane_drive import OWN_CAMERA, shown
+from tests.support.probe import Probe, stamp_of, stamped
 from tests.support.recipe_scene import SIZE, Scene, mount, picture, scene_depth
 from tests.support.recipe_stream import (
     OPTICAL_FRAME,
@@ -25,6 +30,8 @@ from tests.support.recipe_stream import (
     RecipeStream,
     recipe_stream,
 )
+from tests.support.ros_graph import image_message, own_domain
+from tests.support.textured_plane import plane_view, texture, walk
 
 COSTMAP = yaml.safe_load((RECIPES / "nav2_local_costmap.yaml").read_text())["local_costmap"][
     "local_costmap"
@@ -186,6 +193,34 @@ def test_before_there_are_metres_nav2_sees_nothing() -> None:
         points, _ = in_costmap(stream.frame(image, {"points": PointCloud2})["points"])
     assert len(points) == SIZE[0] * SIZE[1]
     assert all(len(buffered(points, source)) == 0 for source in SOURCES.values())
+
+
+@pytest.mark.slow
+def test_with_the_file_as_it_is_the_robot_s_motion_gives_metres() -> None:
+    """A walk along a plane at 0.2 m/s; the camera's place is given where no tf2_msgs is."""
+    line = ["--params-file", str(RECIPES / "stream_depth_nav2.yaml")]
+    line += ["-p", f"camera_pose:={pose_text(MOUNT)}", "-r", "odometry:=/odom"]
+    whole, ratios = texture(), list[float]()
+    with own_domain() as domain, running_node(domain, line) as node:
+        probe = Probe(domain)
+        clouds = probe.listen("points", PointCloud2)
+        first = (node.settings.points_stride - 1) // 2
+        grid = (slice(first, None, node.settings.points_stride),) * 2
+        for number, pose in enumerate(walk(60, step=0.02, turn=0.002)):
+            stamp, view = 10**9 + number * 10**8, plane_view(pose, whole, OWN_CAMERA)
+            info = camera_info_message(None, OWN_CAMERA, *view.depth.shape)
+            probe.publish("/odom", odometry(pose @ inverse(MOUNT), stamp / 1e9))
+            probe.publish("/camera_info", stamped(info, stamp, OPTICAL_FRAME))
+            probe.publish("/image", stamped(image_message(shown(view)), stamp, OPTICAL_FRAME))
+            probe.wait(lambda stamp=stamp: clouds and stamp_of(clouds[-1]) == stamp, 60.0)
+            depth = cloud_points(clouds[-1])["z"]
+            if np.isfinite(depth).any():
+                ratios.append(float(np.nanmedian(depth / view.depth[grid])))
+            if len(ratios) == 3:
+                break
+        probe.close()
+    assert 20 < number < 60  # nothing before the motion has told
+    np.testing.assert_allclose(ratios, 1.0, atol=0.01)
 
 
 def test_the_transform_of_the_page_is_that_of_an_optical_frame() -> None:
