@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -39,7 +40,7 @@ KNOWN = "known"  # name of the model whose right depth is known
 FRAME = "optical"  # frame_id of the pictures
 FAILING = (1, 2, 3)  # a first pixel of this colour makes inference raise
 PATIENCE = 20.0  # seconds that anything may take on a busy machine
-RESEND = 0.5  # seconds after which a picture without an answer is followed by another one
+RESEND = 5.0  # seconds after which a picture without an answer is followed by another one
 LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 OF_DIAGNOSTICS = {b"\0": "OK", b"\1": "WARN", b"\2": "ERROR", b"\3": "STALE"}
 
@@ -208,13 +209,13 @@ class Bench:
         stamp = self.step() if stamp is None else stamp
         lost, known = self.lost(camera), len(self.depths(camera, stamp))
         self.send(camera, message, stamp)
-
-        def done() -> bool:
-            return len(self.depths(camera, stamp)) > known or self.lost(camera) > lost
-
-        self.probe.wait(done, PATIENCE)
+        self.probe.wait(partial(self.came, camera, stamp, known, lost), PATIENCE)
         found = self.depths(camera, stamp)
         return found[-1] if len(found) > known else None
+
+    def came(self, camera: str, stamp: int, known: int, lost: int) -> bool:
+        """Whether there is more depth of a picture than was known, or one more picture is lost."""
+        return len(self.depths(camera, stamp)) > known or self.lost(camera) > lost
 
     def camera(self, name: str) -> Camera:
         """The node's own."""
@@ -247,7 +248,8 @@ class Bench:
             known = len(self.depths(camera, stamp))
             self.measure(camera, image, stamp)
             self.send_scene(camera, image, stamp)
-            self.probe.spin_until(lambda s=stamp, k=known: len(self.depths(camera, s)) > k, RESEND)
+            came = partial(self.came, camera, stamp, known, self.lost(camera))
+            self.probe.spin_until(came, RESEND)
             unit = METRES if camera in MEASURED else 1.0
             if any(self.right(depth / unit, image) for depth in self.depths(camera, stamp)[known:]):
                 return Recovery(count, time.monotonic() - start)

@@ -6,7 +6,6 @@ import array
 import copy
 import inspect
 import math
-import sys
 import time
 import traceback
 from collections import Counter
@@ -18,7 +17,6 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
@@ -48,10 +46,10 @@ from tests.support.odometry import (
     pose_with_covariance,
     tf_topic,
     transform,
-    use_tf_stand_in,
 )
 from tests.support.probe import stamped
 from tests.support.ros_graph import image_message
+from tests.support.tf_here import tf_stand_in
 
 ODOMETRY = {  # cameras on a robot, and the type of its poses
     "driven": "Odometry",
@@ -151,18 +149,6 @@ def fuzzed_bench(domain: dict[str, str]) -> Iterator[Bench]:
         faulty_bench(domain, cameras, drop_frames="false", use_sim_time="true", **own) as bench,
     ):
         yield bench
-
-
-@contextmanager
-def tf_stand_in() -> Iterator[None]:
-    """See use_tf_stand_in; other tests of this process do not see it."""
-    with patch.dict(sys.modules):
-        use_tf_stand_in()
-        try:
-            yield
-        finally:
-            if "transforms" in vars(TransformStamped):
-                del TransformStamped.transforms
 
 
 def leaves(message: Any) -> list[tuple[Any, str, str]]:

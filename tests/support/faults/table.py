@@ -15,6 +15,7 @@ from pathlib import Path
 from tests.support.faults import (
     camera_infos,
     models,
+    motion,
     pictures,
     references,
     requests,
@@ -43,6 +44,7 @@ KINDS = (
     Kind("Pictures", pictures.FAULTS),
     Kind("Camera infos", camera_infos.FAULTS),
     Kind("Measurements for the metric scale", references.FAULTS, references.reference_bench),
+    Kind("Odometry, transforms and clocks", motion.FAULTS, motion.motion_bench),
     Kind("Requests", requests.FAULTS),
     Kind("State files", state_files.FAULTS, state_files.state_bench),
     Kind("Models and devices", models.FAULTS, models.model_bench),
