@@ -44,6 +44,8 @@ class MotionOptions:
         scale_sigma: largest standard deviation of log depth of a point that the scale is measured
             with.
         fewest: points that a measurement needs.
+        share: of the points it could be made with. Where the camera has hardly moved, the few that
+            seem certain are those whose noise makes them near.
         most_spread: robust standard deviation of the log ratios beyond which they say nothing.
     """
 
@@ -56,6 +58,7 @@ class MotionOptions:
     lost_rms: float = 5.0
     scale_sigma: float = 0.2
     fewest: int = 8
+    share: float = 0.2
     most_spread: float = 0.35
 
 
@@ -426,11 +429,12 @@ def measure_scale(
         options: see MotionOptions.
 
     Returns:
-        None when the points are too few, too uncertain or disagree.
+        None when the points are too few, most of them too uncertain, or disagree.
     """
-    good = np.isfinite(ratios) & (points.sigma < options.scale_sigma)
+    known = np.isfinite(ratios)
+    good = known & (points.sigma < options.scale_sigma)
     count = int(good.sum())
-    if count < options.fewest:
+    if count < max(options.fewest, options.share * int(known.sum())):
         return None
     values, sigma = ratios[good], points.sigma[good]
     weights = point_weights(points.pixels[good], sigma, size)

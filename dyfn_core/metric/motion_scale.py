@@ -40,7 +40,7 @@ from dyfn_core.metric.scale_filter import (
 )
 from dyfn_core.threads import one_blas_thread
 
-_DOUBT = 1.5  # factor on a point's sigma: points of one frame err alike
+_DOUBT = 2.5  # factor on a point's sigma: points of one frame err alike
 _SHAPE = 0.11  # standard deviation of log depth that the field leaves to the prediction
 
 

@@ -100,6 +100,17 @@ def test_measurement_needs_points(usable: int, measured: bool) -> None:
     assert (found is not None) == measured
 
 
+@pytest.mark.parametrize(("certain", "measured"), [(19, False), (20, True)])
+def test_measurement_needs_a_share_of_the_points_to_be_certain(
+    certain: int, measured: bool
+) -> None:
+    """The few that are certain where the camera has hardly moved are wrong together."""
+    points = made_points(100)
+    points.sigma[:] = np.where(np.arange(100) < certain, 0.1, 0.5)
+    found = measure_scale(points, np.full(100, 0.1), (100, 100), OPTIONS)
+    assert (found is not None) == measured
+
+
 def test_crowded_corner_does_not_outvote_the_picture() -> None:
     points = made_points(200)
     points.pixels[:150] = [5.0, 5.0]
