@@ -44,6 +44,7 @@ docs: $(READY)
 
 bench: $(READY)
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/backends.py
 
 # e.g. make gpu-train GPU_TRAIN="--art out/art --minutes 10"      (see docs/training.md)
 gpu-train: $(READY)

@@ -56,6 +56,8 @@ class OnnxSession:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads or torch.get_num_threads()
         options.inter_op_num_threads = 1
+        # Threads that wait by spinning take the processor from whatever else runs there.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 3  # errors; warnings are of shapes that were folded
         graph = source if isinstance(source, bytes) else str(source)
         try:
