@@ -102,9 +102,20 @@ def _trainer(options: argparse.Namespace) -> Trainer:
         config = dyfn = _dyfn_config(options, overrides)
         make = partial(_dyfn_task, dyfn, options.out)
     check_folder(options.out, options.resume)  # before anything long is begun
+    _check_data(config)
     processes = Processes(config)
     task = make(device=processes.device)
     return Trainer(task, config, options.out, options.resume, processes)
+
+
+def _check_data(config: RunConfig) -> None:
+    """Before a folder is made and anything is encoded."""
+    for one in config.data:
+        if not one.root.exists():
+            raise ConfigError(
+                f"data: {one.root} does not exist; --data [KIND=]PATH names what to train on, "
+                "dyfn-worlds renders some"
+            )
 
 
 def _dyfn_config(options: argparse.Namespace, overrides: list[str]) -> DyFNRunConfig:

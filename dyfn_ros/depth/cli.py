@@ -59,7 +59,8 @@ def _execute(job: DepthJob, loader: ModelLoader | None, capture: Open | None) ->
             times = f" ({count} times)" if count > 1 else ""
             print(f"dyfn-depth: {word}: {text}{times}", file=sys.stderr)
     rate = outcome.frames / outcome.seconds
-    print(f"{outcome.frames} frames in {outcome.seconds:.1f} s ({rate:.1f} a second)")
+    done = "1 frame" if outcome.frames == 1 else f"{outcome.frames} frames"
+    print(f"{done} in {outcome.seconds:.1f} s ({rate:.1f} a second)")
     for note in outcome.notes:
         print(note)
     for path in outcome.written:

@@ -25,6 +25,7 @@ from dyfn_core.stream.depth_stream import DepthStream
 
 TRUE_DEPTH, WITH_DYFN, BASE = "true depth", "with DyFN", "base model"
 TRUE_VOXEL = 0.02  # metres, of the true cloud
+SHORT = 0.5  # share of a path's extent that its error may be; of one without scale it is 1
 HEADER = (
     "",
     "frames posed",
@@ -195,6 +196,12 @@ def judge(found: SequenceRuns, name: str, tolerance: float = 0.05) -> RunResult:
         trajectory = trajectory_error(run.poses, found.known)
     except RegistrationError as error:
         notes.append(f"no pose error: {error}")
+    if trajectory is not None and trajectory.ate > SHORT * trajectory.extent:
+        notes.append(
+            f"the path's error, {trajectory.ate:.3f} m, is near its extent, "
+            f"{trajectory.extent:.3f} m: it fixes no scale, and the cloud's error says nothing; "
+            "take more frames, or frames farther apart"
+        )
     if trajectory is not None and found.true_cloud is None:
         notes.append("no cloud error: no true depth")
     points, _, metric = aligned_cloud(found, name)

@@ -17,14 +17,16 @@ class TrajectoryError:
 
     ate: root mean square distance of the camera centres after one similarity, metres. rpe_metres,
     rpe_degrees: root mean square of the error of the motion between neighbouring frames, the
-    estimate scaled by that similarity. frames: compared. alignment: estimate -> truth, for clouds:
-    turned by the cameras' orientations, because their centres fix no turn about a straight path.
+    estimate scaled by that similarity. frames: compared. extent: root mean square distance of the
+    true centres from their mean, metres. alignment: estimate -> truth, for clouds: turned by the
+    cameras' orientations, because their centres fix no turn about a straight path.
     """
 
     ate: float
     rpe_metres: float
     rpe_degrees: float
     frames: int
+    extent: float
     alignment: Similarity
 
 
@@ -61,6 +63,7 @@ def trajectory_error(
         _rms(metres),
         _rms(degrees),
         len(both),
+        _rms(np.linalg.norm(truth - truth.mean(axis=0), axis=1)),
         _oriented([pose for _, pose, _ in both], np.array([true for _, _, true in both])),
     )
 

@@ -70,6 +70,7 @@ def test_exact_depth_gives_the_known_poses_and_cloud(matcher: ExactMatcher) -> N
     result = judge(found, TRUE_DEPTH)
     assert (result.posed, result.problems) == (FRAMES, {})
     assert result.trajectory is not None and result.cloud is not None
+    assert result.notes == ()
     assert result.trajectory.ate < 0.004
     assert result.trajectory.rpe_degrees < 0.15
     assert result.trajectory.alignment.scale == pytest.approx(1, abs=5e-3)
@@ -94,6 +95,23 @@ def test_one_unknown_scale_costs_nothing_and_drifting_scale_does(matcher: ExactM
         runs(matcher, drift, ReconstructionOptions(offsets=(1, 3, 7), with_scale=True)), TRUE_DEPTH
     )
     assert scaled.cloud is not None and scaled.cloud.chamfer < 0.02
+
+
+def test_a_path_that_fixes_no_scale_is_told(matcher: ExactMatcher) -> None:
+    found = runs(matcher, np.ones(FRAMES))
+    rng = np.random.default_rng(0)
+    found.known = [
+        None if known is None else moved(known, rng.normal(0, 1, 3)) for known in found.known
+    ]
+    (note,) = judge(found, TRUE_DEPTH).notes
+    assert note.startswith("the path's error, ")
+    assert "fixes no scale" in note
+
+
+def moved(pose: np.ndarray, by: np.ndarray) -> np.ndarray:
+    result = pose.copy()
+    result[:3, 3] += by
+    return result
 
 
 def test_a_reconstruction_is_the_same_each_time(matcher: ExactMatcher) -> None:

@@ -252,6 +252,18 @@ def test_harm_above_the_limit_is_exit_code_1_and_told(
     assert "held-out clips: DyFN's video AbsRel is" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("words", [["base", "CONFIG"], ["dyfn"]])
+def test_data_that_are_nowhere_are_told_before_anything_is_made(
+    words: list[str], data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = str(write_config(tmp_path, data, seed=0))
+    given = [config if word == "CONFIG" else word for word in words]
+    assert main([*given, "--data", str(tmp_path / "absent"), "--out", str(tmp_path / "run")]) == 1
+    told = f"dyfn-train: data: {tmp_path / 'absent'} does not exist; --data [KIND=]PATH names"
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_config_that_is_nowhere_names_the_shipped_ones(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no training config at .*none.yaml; shipped are "):
         read_config(tmp_path / "none.yaml", BaseRunConfig, [])
