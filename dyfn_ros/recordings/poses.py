@@ -39,7 +39,12 @@ class PoseError(RecordingError):
     """There are no usable poses; the message says why."""
 
 
-def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLookup:
+def open_poses(
+    path: Path,
+    frame_id: str,
+    topic: str | None = None,
+    stamps: Literal["header", "log"] = "header",
+) -> PoseLookup:
     """Where the camera with this frame_id was when a frame of the recording was taken.
 
     The whole recording is read at once; PoseTopic reads it as a robot would have met it.
@@ -47,7 +52,8 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
     topic: PoseStamped or PoseWithCovarianceStamped (of the optical frame), Odometry or
     TransformStamped (their child frame must be the camera or be tied to it by TF), or TFMessage;
     None: TF when it leads from the camera to a root through something that moves, else the only
-    pose or odometry topic. "none" does without. An RGB-D folder has its own. Raises PoseError: no
+    pose or odometry topic. "none" does without. stamps: times of the headers, or of the log. An
+    RGB-D folder has its own. Raises PoseError: no
     poses, several candidates (listed), a topic that is absent or of another type.
     """
     if topic == NONE:
@@ -63,12 +69,14 @@ def open_poses(path: Path, frame_id: str, topic: str | None = None) -> PoseLooku
     kinds = _kinds(storage)
     transforms = TransformBuffer(_EVERYTHING)
     for recorded in storage.messages([name for name, kind in kinds.items() if kind == TF]):
-        transforms.take(recorded.message(), recorded.topic.endswith(STATIC))
+        stamp = recorded.log_ns if stamps == "log" else None
+        transforms.take(recorded.message(), recorded.topic.endswith(STATIC), stamp)
     if topic is not None and topic not in kinds:
         raise PoseError(f"{path}: no topic {topic} of poses, odometry or TF: {_listing(kinds)}")
     found = _by_transforms(path, frame_id, topic, kinds, transforms)
     if found is None:
-        found = _by_topic(path, storage, topic or _only(path, kinds), kinds, transforms)
+        name = topic or _only(path, kinds)
+        found = _by_topic(path, storage, name, kinds, transforms, stamps == "log")
         _check_tied(found, frame_id)
 
     def lookup(index: int, stamp_ns: int) -> np.ndarray | None:
@@ -103,12 +111,17 @@ def _by_transforms(
 
 
 def _by_topic(
-    path: Path, storage: Storage, topic: str, kinds: dict[str, str], transforms: TransformBuffer
+    path: Path,
+    storage: Storage,
+    topic: str,
+    kinds: dict[str, str],
+    transforms: TransformBuffer,
+    log_time: bool,
 ) -> CameraPoses:
     options = OdometryOptions(odometry_type=kinds[topic])
     poses = CameraPoses(options, topic, transforms, _quiet, _EVERYTHING)
     for recorded in storage.messages([topic]):
-        poses.take(recorded.message())
+        poses.take(recorded.message(), recorded.log_ns if log_time else None)
     if not poses.taken:
         raise PoseError(f"{path}: {'; '.join(poses.lines()) or f'{topic} holds no pose'}")
     return poses
@@ -161,6 +174,7 @@ class PoseTopic:
         options: OdometryOptions,
         topic: str | None = None,
         stamps: Literal["header", "log"] = "header",
+        whole: bool = False,
     ) -> None:
         """Open the topics.
 
@@ -170,6 +184,7 @@ class PoseTopic:
             topic: Of one of the types of OdometryOptions.odometry_type, or TFMessage; None: the
                 only one of that type, else the only one of any, else /tf.
             stamps: Times of the headers, or of the log.
+            whole: Everything is read at once, and no pose is dropped for its speed or age.
 
         Raises:
             PoseError: There is no such topic, or there are several.
@@ -180,7 +195,8 @@ class PoseTopic:
         name, kind = _chosen(path, kinds, options, topic)
         options = replace(options, odometry_type=kind)
         self.losses: Counter[str] = Counter()
-        self.poses = CameraPoses(options, name, TransformBuffer(options.pose_limits), _quiet)
+        limits = _EVERYTHING if whole else options.pose_limits
+        self.poses = CameraPoses(options, name, TransformBuffer(limits), _quiet, limits)
         self._name, self._log_time = name, stamps == "log"
         self._wait = round(options.odometry_wait * SECOND)
         tf = [found for found, kind in kinds.items() if kind == TF]
@@ -191,6 +207,8 @@ class PoseTopic:
         wanted = ({name} - set(tf)) | (moving if self.poses.wants_transforms else set())
         self._messages = storage.messages(wanted)
         self._next: Recorded | None = next(self._messages, None)
+        while whole and self._next is not None:
+            self._step()
 
     def at(self, stamp: int, frame_id: str, log: int) -> Placed | None:
         """The camera's pose at a frame; frames must come in order.

@@ -128,8 +128,8 @@ def _check_session(reader: argparse.ArgumentParser, given: dict[str, Any], run: 
     if given["reference_topic"] is not None and stream.metric_source != "reference":
         reader.error("--reference-topic has no effect without --metric-source reference")
     if stream.metric_source != "odometry":
-        for name in ("odometry_topic", "odometry_noise"):
-            if given[name] is not None:
+        for name in ("odometry_topic", "odometry_offset", "odometry_noise"):
+            if given[name]:
                 option = f"--{name.replace('_', '-')}"
                 reader.error(f"{option} has no effect without --metric-source odometry")
     if saved and not stream.state_file:
@@ -243,6 +243,14 @@ def _add_source(group: Options) -> None:
         "poses.txt of a folder)",
     )
     add(
+        "--odometry-offset",
+        type=finite,
+        default=0.0,
+        metavar="SECONDS",
+        help="how much the odometry's stamps are after those of images of the same moment, "
+        "negative for before (default: 0)",
+    )
+    add(
         "--odometry-noise",
         type=_noise,
         metavar="SCALE,DISTANCE,ROTATION,SEED",
@@ -305,6 +313,14 @@ def _add_outputs(group: Options) -> None:
         "--pose-topic",
         metavar="TOPIC",
         help='poses, odometry or TF for cloud.ply; "none" for no cloud (default: found by type)',
+    )
+    add(
+        "--pose-offset",
+        type=finite,
+        default=0.0,
+        metavar="SECONDS",
+        help="how much the stamps of --pose-topic are after those of images of the same moment, "
+        "negative for before (default: 0)",
     )
     add(
         "--voxel",

@@ -6,12 +6,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from dyfn_core.evaluation.report.cloud_view import CloudView
 from dyfn_core.files import cannot_write
+from dyfn_core.metric.pose_agreement import PoseAgreement
+from dyfn_core.metric.pose_history import SECOND
 from dyfn_core.prediction import Prediction
 from dyfn_core.scoring.frame_scores import FrameScore
 from dyfn_ros.recordings.open import RecordedFrame
@@ -19,6 +21,7 @@ from dyfn_ros.recordings.poses import PoseError, PoseLookup, open_poses
 from dyfn_ros.replay.cloud import FusedCloud, cloud_view, write_cloud
 from dyfn_ros.replay.frame_spool import FrameSpool
 from dyfn_ros.replay.mcap import ReplayRecording
+from dyfn_ros.replay.pose_feed import pose_doubts
 from dyfn_ros.replay.rerun import RerunRecording
 from dyfn_ros.replay.settings import FILES, LAYOUT, MCAP, NONE, PLY, RAW, RRD, VIDEO, Outputs
 from dyfn_ros.replay.shown_run import ShownRun
@@ -44,7 +47,9 @@ class ReplayOutputs:
     """Takes a replay's frames and leaves the chosen files in a folder, each only when complete.
 
     options: folder, files and their parameters. recording: what is replayed; its poses are looked
-    for in it. warn: takes a reason for what is not written, or not whole. After an exception none
+    for in it, stamps: by which of their times. expected_frames: how many there will be. warn: takes
+    a reason for what is not written, or not whole. doubts: after finish, what makes the poses
+    implausible. After an exception none
     of the files is left behind. cloud: after finish, clouds for the report, if copies of the
     frames were kept. Raises OutputError for a file that cannot be written, or a library
     that is missing.
@@ -54,9 +59,13 @@ class ReplayOutputs:
         self,
         options: Outputs,
         recording: Path,
+        expected_frames: int,
         warn: Callable[[str], None],
+        stamps: Literal["header", "log"] = "header",
     ) -> None:
         self._options, self._recording, self._warn = options, recording, warn
+        self._stamps, self._agreement = stamps, PoseAgreement(expected_frames)
+        self.doubts: list[str] = []
         self._folder = options.folder
         self._writers: list[tuple[Path, _Writer]] = []
         self._spool: FrameSpool | None = None
@@ -141,6 +150,11 @@ class ReplayOutputs:
             self.cloud = cloud_view(spool, fused, runs, options.voxel, options.depth_max)
         for note in self._notes:
             self._warn(note)
+        if (poses := self._poses) is not None:
+            offset = round(self._options.pose_offset * SECOND)
+            found = self._agreement.judge(lambda stamp: poses(-1, stamp + offset))
+            name = self._options.pose_topic or "poses"
+            self.doubts = pose_doubts(found, name, "--pose-offset", self._options.pose_offset)
 
     def _write_cloud(self, spool: FrameSpool, run: ShownRun) -> FusedCloud | None:
         path, options = self._folder / FILES[PLY], self._options
@@ -159,7 +173,7 @@ class ReplayOutputs:
         if self._poses is None:
             topic = self._options.pose_topic
             try:
-                self._poses = open_poses(self._recording, frame.frame_id, topic)
+                self._poses = open_poses(self._recording, frame.frame_id, topic, self._stamps)
             except PoseError as error:
                 if topic not in (None, NONE):
                     raise
@@ -167,4 +181,6 @@ class ReplayOutputs:
                     self._notes.append(f"no cloud.ply: {error}")
                 self._fuse = self._posed = False
                 return None
-        return self._poses(frame.index, frame.stamp_ns)
+        self._agreement.push(frame.image, frame.stamp_ns, frame.camera_matrix)
+        offset = round(self._options.pose_offset * SECOND)
+        return self._poses(frame.index, frame.stamp_ns + offset)

@@ -188,7 +188,7 @@ class SourceReader:
                 f"{self._source.recording}: metric_source is 'odometry', expected a recording "
                 "with poses; a video or a folder of pictures has none"
             )
-        return PoseFeed(self._source, options)
+        return PoseFeed(self._source, options, self.expected)
 
     def warn(self, reason: str, times: int = 1) -> None:
         """Note data that is there but could not be used."""

@@ -108,6 +108,8 @@ def _metrics(
             "depth_transform": source.depth_transform,
             "depth_scale": source.depth_scale,
             "depth_offset": source.depth_offset or None,
+            "odometry_offset": source.odometry_offset or None,
+            "pose_offset": outputs.pose_offset or None,
             "depth_max": None if math.isinf(outputs.depth_max) else outputs.depth_max,
             **result.options,
         },

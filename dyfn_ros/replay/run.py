@@ -68,7 +68,9 @@ def replay(
     stabilized = run.stream.stabilize and model.stabilizer is not None
     with computing_threads(run.threads) as threads:
         runner = _runner(reader, run, model)
-        files = ReplayOutputs(outputs, source.recording, reader.warn)
+        files = ReplayOutputs(
+            outputs, source.recording, reader.expected, reader.warn, source.stamps
+        )
         base, alone = None, None
         plain = run.without_odometry()
         compared = run.compare and (stabilized or plain is not None)
@@ -94,6 +96,7 @@ def replay(
     options = {**stream_facts(run), "backend": model.backend, "threads": threads}
     facts = runner.facts()
     doubts = reader.doubts(evaluation.scored_frames, outputs.depth_max)
+    doubts += [*runner.doubts(), *files.doubts]
     result = Result(
         run.model, stabilized, evaluation, base, alone, options, files.cloud, facts, doubts
     )

@@ -80,6 +80,8 @@ class StreamRunner:
             Each frame with the session's output.
         """
         for frame in frames:
+            if self._poses is not None:
+                self._poses.look(frame)
             start = time.perf_counter()
             stamp = _seconds(frame)
             if self._references is not None:
@@ -145,6 +147,10 @@ class StreamRunner:
         for reason, count in sorted(self._session.unused_references.items()):
             found[f"{topic}: measurements or points not used: {reason}"] = count
         return found
+
+    def doubts(self) -> list[str]:
+        """What makes the poses implausible, a sentence each."""
+        return [] if self._poses is None else self._poses.doubts()
 
     def losses(self) -> dict[str, int]:
         """Measurements and poses that could not be read, with how often."""

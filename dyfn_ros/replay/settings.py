@@ -48,6 +48,7 @@ class Source:
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
         odometry_topic: Poses for metric_source "odometry", see recordings.poses.PoseTopic.
+        odometry_offset: Seconds that their stamps are after those of the images.
         odometry_noise: Errors that are added to them; None: none.
         stamps: Times of the headers, or of the log.
         tolerance: Seconds between the stamps of an image and its ground truth.
@@ -65,6 +66,7 @@ class Source:
     depth_offset: float = 0.0
     reference_topic: str | None = None
     odometry_topic: str | None = None
+    odometry_offset: float = 0.0
     odometry_noise: OdometryNoise | None = None
     stamps: Literal["header", "log"] = "header"
     tolerance: float = 0.02
@@ -154,6 +156,7 @@ class Outputs:
         folder: Takes every file.
         write: Names of FILES, beside scores and report.
         pose_topic: Poses for cloud.ply, see recordings.poses.open_poses.
+        pose_offset: Seconds that their stamps are after those of the images.
         voxel: Edge of a voxel of cloud.ply, metres.
         depth_max: Ground truth and points of cloud.ply beyond it (metres) are left out.
         progress: Whether a progress bar is drawn on stderr.
@@ -162,6 +165,7 @@ class Outputs:
     folder: Path
     write: tuple[str, ...] = DEFAULT
     pose_topic: str | None = None
+    pose_offset: float = 0.0
     voxel: float = VOXEL
     depth_max: float = math.inf
     progress: bool = True

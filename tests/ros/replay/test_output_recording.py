@@ -147,7 +147,7 @@ def test_clouds_are_in_metres_of_the_world(tmp_path: Path) -> None:
     write_rgbd_recording(tmp_path / "walk", facing_a_wall(5), jpeg_quality=None)
     (tmp_path / "out").mkdir()
     chosen = Outputs(tmp_path / "out", write=("mcap",))
-    with ReplayOutputs(chosen, tmp_path / "walk", lambda text: pytest.fail(text)) as outputs:
+    with ReplayOutputs(chosen, tmp_path / "walk", 3, lambda text: pytest.fail(text)) as outputs:
         for frame in open_recording(tmp_path / "walk").frames():
             depth = WALL - 0.3 * frame.index + np.zeros(SIZE)
             pose = perfect_up_to(2.5, depth)

@@ -67,7 +67,7 @@ def written(tmp_path: Path) -> Callable[..., list[str]]:
         (tmp_path / "out").mkdir(exist_ok=True)
         warnings: list[str] = []
         chosen = Outputs(tmp_path / "out", **options)
-        with ReplayOutputs(chosen, tmp_path / "walk", warnings.append) as outputs:
+        with ReplayOutputs(chosen, tmp_path / "walk", 3, warnings.append) as outputs:
             for frame in open_recording(tmp_path / "walk").frames():
                 depth = WALL - 0.3 * frame.index + np.zeros(SIZE)
                 outputs.write(frame, perfect_up_to(2.5, depth), FrameScore(1.0, 10))
