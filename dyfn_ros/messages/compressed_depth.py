@@ -94,7 +94,7 @@ def encode_compressed_depth(
     return f"{encoding}; compressedDepth png", _HEADER.pack(0, a, b) + data.tobytes()
 
 
-PRECISION = 1e-4  # largest relative error of encode_depth_range, up to RATIO
+PRECISION = 2.5e-4  # largest relative error of encode_depth_range, up to RATIO
 RATIO = 1 + 65_534 * 2 * PRECISION  # farthest over nearest depth; beyond it the error grows with it
 
 

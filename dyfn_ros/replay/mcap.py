@@ -40,6 +40,7 @@ DEPTH = "/stream_depth/depth/image"
 POINTS = "/stream_depth/points"
 COLOURED = "/stream_depth/depth/colored/compressed"
 COLOURED_TRUTH = "/stream_depth/depth/colored_ground_truth/compressed"
+SHOWN_QUALITY = 75  # of JPEGs that are looked at only
 RANGE_FRAMES = 32
 COARSE = 5e-3  # relative error of compressed depth that is warned about
 _FLOAT32 = 7  # sensor_msgs/PointField
@@ -185,7 +186,9 @@ class ReplayRecording:
         for topic, values in pictures.items():
             if values is not None:
                 painted = colour_depth(values, *self._ends)
-                self._writer.write_jpeg(topic, painted, frame.stamp_ns, frame_id, log_ns=time)
+                self._writer.write_jpeg(
+                    topic, painted, frame.stamp_ns, frame_id, quality=SHOWN_QUALITY, log_ns=time
+                )
 
 
 def _namespace(image_topic: str) -> str:

@@ -25,7 +25,7 @@ tbody tr:last-child td { border-bottom: 0; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 tr.muted td { color: var(--soft); }
 table.wide { font-size: .8rem; width: 100%; } table.wide th, table.wide td { padding: .2rem .3rem; }
-table.narrow :is(th, td), table.wide td { overflow-wrap: normal; }
+:is(table.narrow, table.wide) :is(th, td) { overflow-wrap: normal; }
 table.narrow :is(th, td):first-child, table.wide td:first-child, td:last-child {
   overflow-wrap: anywhere; }
 img { max-width: 100%; height: auto; display: block; margin: .5rem 0; border-radius: 6px; }
