@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,14 @@ class OpenVinoGraph:
         Raises:
             CheckpointError: It cannot be read, or has something that OpenVINO does not know.
         """
-        core = openvino.Core()
         settings = {
             "INFERENCE_NUM_THREADS": threads or torch.get_num_threads(),
             "INFERENCE_PRECISION_HINT": "f32",  # else bfloat16 where the CPU has it
             "PERFORMANCE_HINT": "LATENCY",
         }
         try:
-            graph = core.read_model(source if isinstance(source, bytes) else str(source))
-            self._request = core.compile_model(graph, "CPU", settings).create_infer_request()
+            graph = _core().read_model(source if isinstance(source, bytes) else str(source))
+            self._request = _core().compile_model(graph, "CPU", settings).create_infer_request()
         except Exception as error:
             name = "an ONNX graph" if isinstance(source, bytes) else source
             raise CheckpointError(f"{name} cannot be loaded by OpenVINO: {error}") from error
@@ -45,6 +45,17 @@ class OpenVinoGraph:
         given = {name: tensors[name].numpy(force=True) for name in self.inputs}
         found = self._request.infer(given)
         return {name: torch.tensor(found[index]) for index, name in enumerate(self.outputs)}
+
+
+@cache
+def _core() -> openvino.Core:
+    """One for the process, never let go.
+
+    A core's CPU plugin sets the thread's stack for signals, and sets the one before again when it
+    goes. Cores that do not go in the reverse order leave a stack that is freed, and the next
+    signal with a Python handler (a loader's SIGCHLD, Ctrl-C) ends the process.
+    """
+    return openvino.Core()
 
 
 def _name(port: Any) -> str:

@@ -151,7 +151,10 @@ def test_objective_for_another_output_is_refused_with_what_mends_it(
     own = {} if kind == "paper" else {"windows": [1, 2], "temporal_weight": 0.3}
     method = {**RUN["method"], "objective": {"kind": kind, **own}}
     config = tmp_path / "config.yaml"
-    values = {"method": method, "base": str(tmp_path / "base.safetensors"), "data": [str(data)]}
+    values: dict[str, Any] = {"method": method, "data": [str(data)]}
+    values["base"] = str(tmp_path / "base.safetensors")
+    # A size at which the paper's objective can be had.
+    values["stages"] = [{"from_step": 0, "batch": 1, "sizes": [[192, 256]]}]
     config.write_text(yaml.safe_dump({**RUN, **values}))
     assert main(["dyfn", str(config), "--out", str(tmp_path / "run")]) == 1
     assert f"set method.objective to {mended}" in capsys.readouterr().err

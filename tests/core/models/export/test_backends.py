@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -118,6 +119,41 @@ def test_mini_is_torchs_over_a_stream(mini: GeometryModel, backend: str) -> None
     assert largest_difference(plain, run(other, walk(5), stabilize=False)) < CLOSE
     # The comparison can fail: the stream is another one without DyFN.
     assert largest_difference(plain, run(other, walk(5))) > CLOSE
+
+
+SIGNALS = """
+import gc, importlib, signal, sys
+from onnx import TensorProto, helper
+
+ports = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [4]) for name in ("image", "depth")]
+double = helper.make_node("Add", ["image", "image"], ["depth"])
+graph = helper.make_graph([double], "double", ports[:1], ports[1:])
+model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)]).SerializeToString()
+module = importlib.import_module("dyfn_core.models.export." + sys.argv[1])
+graphs = [getattr(module, sys.argv[2])(model) for _ in range(5)]
+while graphs:  # the first one made goes first
+    graphs.pop(0)
+    gc.collect()
+caught = []
+signal.signal(signal.SIGCHLD, lambda *_: caught.append(1))
+signal.raise_signal(signal.SIGCHLD)
+print("caught", len(caught))
+"""
+
+
+@pytest.mark.parametrize(
+    ("backend", "module", "name"),
+    [
+        ("onnxruntime", "session", "OnnxSession"),
+        ("openvino", "openvino_graph", "OpenVinoGraph"),
+    ],
+)
+def test_signals_are_caught_after_graphs_are_gone(backend: str, module: str, name: str) -> None:
+    pytest.importorskip(backend)
+    code = [sys.executable, "-c", SIGNALS, module, name]
+    root = Path(__file__).parents[4]
+    done = subprocess.run(code, capture_output=True, text=True, cwd=root, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "caught 1\n"), done.stderr
 
 
 @pytest.mark.slow
