@@ -68,6 +68,12 @@ def _add_training(commands: Commands, name: str, purpose: str) -> None:
     add_out(group, "folder of the run")
     group.add_argument("--resume", action="store_true", help="go on from state.pt in --out")
     group.add_argument("--max-steps", type=at_least_one, metavar="N", help="stop at step N")
+    group.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="only tell steps, time of a step and memory on this machine, on made clips (method "
+        "unrolled)",
+    )
 
 
 def _add_curve(commands: Commands) -> None:

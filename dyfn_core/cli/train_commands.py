@@ -31,6 +31,7 @@ from dyfn_core.training.config import (
     read_values,
     settings_of,
 )
+from dyfn_core.training.dry_run import report, stage_costs
 from dyfn_core.training.dyfn_config import DyFNRunConfig, UnrolledMethod
 from dyfn_core.training.former_config import (
     METHODS,
@@ -75,6 +76,9 @@ def execute(options: argparse.Namespace) -> int:
             shares = options.shares or [1.0] * len(options.models)
             save_model(average(options.models, shares), options.out)
             return 0
+        if options.dry_run:
+            print(_dry_run(options))
+            return 0
         trainer = _trainer(options)
         trainer.train(options.max_steps)
         _tell_result(trainer)
@@ -116,6 +120,20 @@ def _check_data(config: RunConfig) -> None:
                 f"data: {one.root} does not exist; --data [KIND=]PATH names what to train on, "
                 "dyfn-worlds renders some"
             )
+
+
+def _dry_run(options: argparse.Namespace) -> str:
+    """What the run would cost here; neither data nor the folder are touched."""
+    if options.command == "base":
+        raise ConfigError("--dry-run: only `dyfn` with method unrolled has it")
+    config = _dyfn_config(options, [*options.set, *_data_override(options.data)])
+    if not isinstance(config.method, UnrolledMethod):
+        raise ConfigError(f"--dry-run: method {config.method.kind!r} has none, only 'unrolled'")
+    cached = config.method.cache_draws > 0
+    update = {"cache_draws": 0, "cache": None, "cache_seed": None}
+    config = config.model_copy(update={"method": config.method.model_copy(update=update)})
+    task = UnrolledTask(config, options.out, Processes(config).device)
+    return report(list(stage_costs(task, config)), cached)
 
 
 def _dyfn_config(options: argparse.Namespace, overrides: list[str]) -> DyFNRunConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -49,17 +50,45 @@ class Crop:
 
 
 def draw_crop(
-    rng: np.random.Generator, source_aspect: float, aspect: float, smallest: float = 0.5
+    rng: np.random.Generator,
+    source_aspect: float,
+    aspect: float,
+    smallest: float = 0.5,
+    widths: tuple[float, float] = (0.0, math.inf),
 ) -> Crop:
     """A window of the given aspect (width / height) covering at least `smallest` of the fit.
 
-    source_aspect: width / height of the frames. The window lies anywhere inside the frame.
+    source_aspect: width / height of the frames. widths: the least and greatest width of the window,
+    relative to the frame's, as far as the frame allows. The window lies anywhere inside the frame.
     """
     width, height = min(1.0, aspect / source_aspect), min(1.0, source_aspect / aspect)
     zoom = rng.uniform(smallest, 1.0) if rng.random() < 0.8 else 1.0
+    zoom = min(1.0, max(min(zoom, widths[1] / width), widths[0] / width))
     width, height = width * zoom, height * zoom
     x, y = rng.uniform(0, 1 - width), rng.uniform(0, 1 - height)
     return Crop((x, y, x + width, y + height), bool(rng.random() < 0.5))
+
+
+def crop_widths(fov: tuple[float, float] | None, focal: float) -> tuple[float, float]:
+    """The least and greatest width of a window, relative to the frame's, for a field of view.
+
+    fov: horizontal, degrees; None for no bound. focal: in units of the frame's width.
+    """
+    if fov is None:
+        return 0.0, math.inf
+    narrow, wide = (2 * focal * math.tan(math.radians(angle) / 2) for angle in fov)
+    return narrow, wide
+
+
+def clamped(depth: np.ndarray, factor: float) -> np.ndarray:
+    """Depth, H x W, of at most `factor` times the depth that 1% of the known pixels are nearer
+    than. What is unknown (NaN) or sky (inf) stays so."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    if not known.size:
+        return depth
+    largest = np.quantile(known, 0.01) * factor
+    result: np.ndarray = np.where(np.isfinite(depth), np.minimum(depth, largest), depth)
+    return result.astype(depth.dtype)
 
 
 def apply_crop(

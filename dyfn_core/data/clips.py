@@ -12,11 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from dyfn_core.data.augment import (
     apply_appearance,
     apply_crop,
+    clamped,
+    crop_widths,
     draw_appearance,
     draw_crop,
     mirrored_pose,
@@ -24,17 +26,36 @@ from dyfn_core.data.augment import (
 from dyfn_core.data.frames import DataError, FrameError, FrameSequence
 from dyfn_core.data.pool import DataPool, DataSpec, open_pool
 
+PREFETCHED = 6  # batches that a process makes ahead
 MOST_UNREADABLE = 50  # clips in a row that cannot be read end a run
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class SizeStage:
-    """From this step on: batches of `batch` clips at one of `sizes` (H, W), multiples of 32."""
+    """From this step on: batches of `batch` clips at one of `sizes` (H, W), multiples of 32; or,
+    without sizes, at one of an area (pixels) and an aspect (width / height) drawn evenly from these
+    ranges. tokens: range of the number of tokens of a vision transformer; None: the image's own."""
 
     from_step: int
     sizes: tuple[tuple[int, int], ...]
     batch: int
+    area: tuple[int, int] | None = None
+    aspect: tuple[float, float] | None = None
+    tokens: tuple[int, int] | None = None
+
+    def size(self, rng: np.random.Generator) -> tuple[int, int]:
+        """Draw the size of a batch."""
+        if self.area is None or self.aspect is None:
+            return self.sizes[rng.integers(len(self.sizes))]
+        area, aspect = rng.uniform(*self.area), float(np.exp(rng.uniform(*np.log(self.aspect))))
+        return multiples(area, aspect)
+
+
+def multiples(area: float, aspect: float) -> tuple[int, int]:
+    """The height and width, multiples of 32, nearest to those of an area and an aspect."""
+    height = (area / aspect) ** 0.5
+    return max(32, 32 * round(height / 32)), max(32, 32 * round(height * aspect / 32))
 
 
 @dataclass(frozen=True)
@@ -44,6 +65,8 @@ class ClipSource:
     data: the data sets. kinds: of rendered folders, "frames" and/or "clip". length: frames of a
     clip, all from one sequence; 1 for single frames. strides: smallest and largest step between
     them. relist_seconds: how often rendered folders that are still growing are listed again.
+    fov: bounds of the horizontal field of view, degrees. depth_clamp: depth is at most that many
+    times the depth that 1% of the pixels are nearer than. workers: processes that make batches.
     """
 
     data: tuple[DataSpec, ...]
@@ -56,6 +79,9 @@ class ClipSource:
     depth_divisor: int = 2
     seed: int = 0
     relist_seconds: float = 120.0
+    fov: tuple[float, float] | None = None
+    depth_clamp: float | None = None
+    workers: int = 1
 
 
 @dataclass(frozen=True)
@@ -98,18 +124,21 @@ class Clip:
 @dataclass(frozen=True)
 class ClipBatch:
     """image: B x T x 3 x H x W uint8. depth: B x T x h x w metres, inf sky, NaN invalid.
-    intrinsics: B x T x 4 normalised fx, fy, cx, cy."""
+    intrinsics: B x T x 4 normalised fx, fy, cx, cy. tokens: of an image; None: as many as it has
+    cells."""
 
     image: Tensor
     depth: Tensor
     intrinsics: Tensor
+    tokens: int | None = None
 
 
 class ClipBatches(IterableDataset[tuple[ClipBatch | Exception, list[str]]]):
     """An endless stream of batches, each with what was drawn but could not be read.
 
-    The n-th depends on the seed, n and the data alone. What ends the stream comes in a batch's
-    place: raised in another process, its message would be a traceback.
+    The n-th depends on the seed, n and the data alone: of N workers, each makes every N-th. What
+    ends the stream comes in a batch's place: raised in another process, its message would be a
+    traceback.
     """
 
     def __init__(self, source: ClipSource, start: int = 0, split: str = "train") -> None:
@@ -117,7 +146,9 @@ class ClipBatches(IterableDataset[tuple[ClipBatch | Exception, list[str]]]):
         self.source, self.start, self.split = source, start, split
 
     def __iter__(self) -> Iterator[tuple[ClipBatch | Exception, list[str]]]:
-        index, listed, pool = self.start, -np.inf, None
+        worker = get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        index, listed, pool = self.start + first, -np.inf, None
         while True:
             unreadable: list[str] = []
             try:
@@ -129,11 +160,11 @@ class ClipBatches(IterableDataset[tuple[ClipBatch | Exception, list[str]]]):
                 yield error, unreadable
                 return
             yield batch, unreadable
-            index += 1
+            index += step
 
 
 class BatchLoader:
-    """Batches made by one background process; what could not be read is logged and counted.
+    """Batches made by background processes, in order; what could not be read is logged and counted.
 
     unreadable: message -> how often it was drawn; a given Counter is added to.
     Raises DataError when too many clips in a row cannot be read.
@@ -146,8 +177,8 @@ class BatchLoader:
         loader = DataLoader(
             ClipBatches(source, start),
             batch_size=None,
-            num_workers=1,
-            prefetch_factor=6,
+            num_workers=source.workers,
+            prefetch_factor=PREFETCHED,
             worker_init_fn=_leave_signals_to_the_run,
         )
         self._batches = iter(loader)
@@ -196,7 +227,7 @@ def draw_batch(
     """
     rng = np.random.default_rng([source.seed, index])
     stage = [stage for stage in source.stages if stage.from_step <= index][-1]
-    size = stage.sizes[rng.integers(len(stage.sizes))]
+    size = stage.size(rng)
     chosen = rng.choice(len(pool.sequences), stage.batch, p=pool.shares)
     unreadable = [] if unreadable is None else unreadable
     clips = [_readable_clip(source, pool, int(n), size, rng, unreadable) for n in chosen]
@@ -204,6 +235,7 @@ def draw_batch(
         torch.from_numpy(np.stack([clip.images for clip in clips]).transpose(0, 1, 4, 2, 3)),
         torch.from_numpy(np.stack([clip.depth for clip in clips])),
         torch.from_numpy(np.stack([clip.intrinsics for clip in clips])),
+        None if stage.tokens is None else int(rng.integers(stage.tokens[0], stage.tokens[1] + 1)),
     )
 
 
@@ -244,10 +276,13 @@ def draw_clip(
         frame = sequence.read(int(index))
         if view is None:
             aspect = frame.image.shape[1] / frame.image.shape[0]
-            view = draw_crop(rng, aspect, size[1] / size[0], source.smallest_view)
+            widths = crop_widths(source.fov, float(frame.intrinsics[0]))
+            view = draw_crop(rng, aspect, size[1] / size[0], source.smallest_view, widths)
         image, depth, intrinsics = apply_crop(
             frame.image, frame.depth, frame.intrinsics, view, size, depth_size
         )
+        if source.depth_clamp is not None:
+            depth = clamped(depth, source.depth_clamp)
         frames.append((apply_appearance(image, look, number), depth, intrinsics))
         if frame.pose is not None:
             poses.append(mirrored_pose(frame.pose) if view.flip else frame.pose)

@@ -45,11 +45,31 @@ class Strict(BaseModel):
 
 
 class StageConfig(Strict):
-    """From step `from_step` on: batches of `batch` at one of `sizes` (H, W)."""
+    """From step `from_step` on: batches of `batch` at one of `sizes` (H, W), or at a size drawn
+    from `area` (pixels, least and greatest) and `aspect` (width / height).
+
+    Attributes:
+        tokens: Least and greatest number of tokens that a vision transformer divides an image
+            into; default: as many as the image has cells.
+    """
 
     from_step: int = Field(ge=0)
-    sizes: tuple[tuple[int, int], ...] = Field(min_length=1)
+    sizes: tuple[tuple[int, int], ...] = ()
     batch: int = Field(ge=1)
+    area: tuple[int, int] | None = None
+    aspect: tuple[float, float] | None = None
+    tokens: tuple[int, int] | None = None
+
+    @model_validator(mode="after")
+    def _has_sizes(self) -> StageConfig:
+        ranges = self.area is not None
+        if (self.aspect is not None) != ranges or bool(self.sizes) == ranges:
+            raise ValueError("a stage has either `sizes`, or `area` and `aspect`")
+        for name in ("area", "aspect", "tokens"):
+            given = getattr(self, name)
+            if given is not None and not 0 < given[0] <= given[1]:
+                raise ValueError(f"{name} must rise from more than 0, got {list(given)}")
+        return self
 
     @field_validator("sizes")
     @classmethod
@@ -121,7 +141,11 @@ class LoopConfig(Strict):
         mixed_precision: Of the network; losses are always float32.
         parts: A batch is computed in that many equal parts, shared out among the processes;
             default: one for each process.
-        learning_rate: Highest rate of the cosine schedule.
+        learning_rate: Highest rate of the schedule.
+        schedule: "cosine" falls to 1% at the end; "halving" is constant for `constant_steps` and
+            is then halved every `halve_every` steps, as in the released training.
+        constant_steps: See `schedule`.
+        halve_every: See `schedule`.
         weight_decay: Of AdamW.
         warmup_steps: Steps in which the rate rises.
         clip_norm: Largest norm of the gradient.
@@ -143,6 +167,9 @@ class LoopConfig(Strict):
     mixed_precision: Literal["no", "bf16", "fp16"] = "no"
     parts: int | None = Field(None, ge=1)
     learning_rate: float = Field(1e-3, gt=0)
+    schedule: Literal["cosine", "halving"] = "cosine"
+    constant_steps: int = Field(1000, ge=0)
+    halve_every: int = Field(5000, ge=1)
     weight_decay: float = Field(0.01, ge=0)
     warmup_steps: int = Field(200, ge=0)
     clip_norm: float = Field(1.0, gt=0)
@@ -163,6 +190,11 @@ class RunConfig(LoopConfig):
         stages: Sizes of batches and images, from a step on.
         augment_strength: Of the changes of colour, blur and noise; 0 is none, 1 the full range.
         smallest_view: Smallest side of a crop, relative to the largest that fits into the view.
+        fov: Least and greatest horizontal field of view of a crop, degrees; default: no bound.
+        depth_clamp: Depth is at most that many times the depth that 1% of the pixels are nearer
+            than; default: no bound.
+        loader_workers: Processes that read and augment clips; the clips are the same with any
+            number of them.
         validation_rgbd: A recording with rgb/, depth/ and K.txt to validate on too.
     """
 
@@ -171,6 +203,9 @@ class RunConfig(LoopConfig):
     stages: tuple[StageConfig, ...] = Field(min_length=1)
     augment_strength: float = Field(1.0, ge=0, le=1)
     smallest_view: float = Field(0.5, gt=0, le=1)
+    fov: tuple[float, float] | None = None
+    depth_clamp: float | None = Field(None, gt=1)
+    loader_workers: int = Field(1, ge=1)
     validation_rgbd: Path | None = None
 
     @field_validator("stages")

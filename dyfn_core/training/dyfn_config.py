@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from dyfn_core.data.clips import multiples
 from dyfn_core.losses.full.objective import Objective
 from dyfn_core.models.dyfn import DyFNConfig
-from dyfn_core.training.config import RunConfig, Strict
+from dyfn_core.training.config import RunConfig, StageConfig, Strict
 from dyfn_core.training.config_errors import check_fields
 
 
@@ -100,7 +101,7 @@ AnyObjective = TermsObjective | DisparityObjective | PaperObjective
 
 
 class UnrolledMethod(Strict):
-    """The paper's way: DyFN is unrolled over clips of latents and decoded.
+    """As in the paper: DyFN is unrolled over clips of latents and decoded.
 
     Attributes:
         cache: Folder of encoded clips; default: OUT/latents.
@@ -229,7 +230,7 @@ class DyFNRunConfig(RunConfig):
         return self
 
     def _check_levels(self, objective: Objective) -> None:
-        for height, width in {size for stage in self.stages for size in stage.sizes}:
+        for height, width in {size for stage in self.stages for size in stage_sizes(stage)}:
             try:
                 objective.check_size((height // 2, width // 2))
             except ValueError as error:
@@ -237,6 +238,13 @@ class DyFNRunConfig(RunConfig):
                     f"stages.sizes [{height}, {width}]: the losses are computed at half of it. "
                     f"{error}. Or leave that level out of method.objective.levels"
                 ) from error
+
+
+def stage_sizes(stage: StageConfig) -> tuple[tuple[int, int], ...]:
+    """The sizes (H, W) of a stage; of ranges, the smallest and largest at both ends of aspect."""
+    if stage.area is None or stage.aspect is None:
+        return stage.sizes
+    return tuple(multiples(area, aspect) for area in stage.area for aspect in stage.aspect)
 
 
 def _check_lengths(length: int, cache_length: int, strides: tuple[int, int]) -> None:

@@ -205,9 +205,13 @@ class Trainer:
 
     def _set_rates(self) -> None:
         warm = min(1.0, (self.step + 1) / max(1, self.config.warmup_steps))
-        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, self.progress())))
+        if self.config.schedule == "halving":
+            past = max(0, self.step - self.config.constant_steps)
+            share = 0.5 ** (past // self.config.halve_every)
+        else:
+            share = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, self.progress())))
         for group, rate in zip(self.optimizer.param_groups, self.rates, strict=True):
-            group["lr"] = rate * warm * (0.01 + 0.99 * cosine)
+            group["lr"] = rate * warm * share
 
     def _count_bad(self, finite: bool) -> None:
         self.bad_steps = 0 if finite else self.bad_steps + 1

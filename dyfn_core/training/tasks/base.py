@@ -39,9 +39,15 @@ def clip_source(config: RunConfig, length: int, strides: tuple[int, int]) -> Cli
         kinds=config.kinds,
         length=length,
         strides=strides,
-        stages=tuple(SizeStage(s.from_step, s.sizes, s.batch) for s in config.stages),
+        stages=tuple(
+            SizeStage(s.from_step, s.sizes, s.batch, s.area, s.aspect, s.tokens)
+            for s in config.stages
+        ),
         augment_strength=config.augment_strength,
         smallest_view=config.smallest_view,
+        fov=config.fov,
+        depth_clamp=config.depth_clamp,
+        workers=config.loader_workers,
         seed=config.seed,
     )
 

@@ -44,7 +44,7 @@ class LatentClips:
 def encode_clips(model: GeometryModel, batch: ClipBatch) -> LatentClips:
     """Every frame of every clip through the frozen encoder, one clip at a time."""
     size = (batch.image.shape[-2], batch.image.shape[-1])
-    tokens = max(1, round(size[0] * size[1] / model.token_cell**2))
+    tokens = batch.tokens or max(1, round(size[0] * size[1] / model.token_cell**2))
     latents = [model.encode(clip.to(model.device).float() / 255, tokens) for clip in batch.image]
     return LatentClips(
         torch.stack([latent.features.half().cpu() for latent in latents]).contiguous(),
@@ -208,7 +208,12 @@ def _sub_clip(
 
 def fingerprint(model: GeometryModel, source: ClipSource) -> dict[str, Any]:
     """What a cache depends on: the frozen parameters, and where its clips come from."""
-    described = {key: value for key, value in asdict(source).items() if key != "relist_seconds"}
+    ignored = ("relist_seconds", "workers")
+    described = {key: value for key, value in asdict(source).items() if key not in ignored}
+    for values in (described, *described["stages"]):  # caches of earlier versions lack these
+        for name in ("fov", "depth_clamp", "area", "aspect", "tokens"):
+            if values.get(name, 0) is None:
+                del values[name]
     described = json.loads(json.dumps(described, default=str))
     return {"model": base_digest(model), "source": described}
 
