@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSCompatibility, qos_check_compatible, qos_profile_system_default
 from sensor_msgs.msg import CameraInfo, Image
 
@@ -69,7 +70,8 @@ def scan_of(depth: Image, info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
 
 def scanned(stream: RecipeStream, encoding: str) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """-> the node's messages, and the points x ahead, y left of the scan in the camera's frame."""
-    assert stream.probe.set("depth_encoding", encoding).successful
+    value = Parameter("depth_encoding", value=encoding)
+    assert stream.node.set_parameters_atomically([value]).successful
     image = picture(scene_depth(SCENE, MOUNT))
     image[:, :6, 2] = 255  # PinholeModel finds nothing there
     answer = stream.frame(image, KINDS)
