@@ -17,6 +17,7 @@ from tests.support.faults import (
     models,
     motion,
     pictures,
+    processes,
     references,
     requests,
     state_files,
@@ -48,6 +49,7 @@ KINDS = (
     Kind("Requests", requests.FAULTS),
     Kind("State files", state_files.FAULTS, state_files.state_bench),
     Kind("Models and devices", models.FAULTS, models.model_bench),
+    Kind("Processes", processes.FAULTS, processes.process_bench),
 )
 
 
