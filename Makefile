@@ -43,7 +43,8 @@ docs: $(READY)
 	$(BIN)/mkdocs build --quiet
 
 bench: $(READY)
-	$(BIN)/python benchmarks/speed.py
+	mkdir -p out
+	$(BIN)/python benchmarks/speed.py --out out/speed.json --page docs/PERFORMANCE.md
 	$(BIN)/python benchmarks/backends.py
 
 # e.g. make gpu-train GPU_TRAIN="--art out/art --minutes 10"      (see docs/training.md)
