@@ -41,7 +41,8 @@ class StepInfo:
     input `image`. network_size: see Latent. num_tokens: None is the model's own. preparation: how
     the input is made of the camera's image, RGB in 0..1. state: shapes of the inputs by name; the
     outputs have NEXT before the name. first_state: what a stream begins with. metres_of_focal:
-    see AffineDepth. The other fields: see GeometryModel.
+    see AffineDepth. precision: "int8" where layers compute in 8 bits. The other fields: see
+    GeometryModel.
     """
 
     version: str
@@ -57,6 +58,7 @@ class StepInfo:
     state: dict[str, list[int]]
     first_state: dict[str, str]
     metres_of_focal: tuple[float, float] | None = None
+    precision: str = "float32"
     format: int = FORMAT
 
     @property
