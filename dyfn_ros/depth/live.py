@@ -48,13 +48,18 @@ class LiveCapture:
     """
 
     def __init__(
-        self, name: str, capture: Capture, clock: Callable[[], float] = time.monotonic
+        self,
+        name: str,
+        capture: Capture,
+        expected: str,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Begin to read.
 
         Args:
             name: Of the source, for messages.
             capture: Opened.
+            expected: What the message says was expected when it is not open.
             clock: Seconds.
 
         Raises:
@@ -66,10 +71,7 @@ class LiveCapture:
         self._read, self._closing = 0, False
         self._changed = threading.Condition()
         if not capture.isOpened():
-            raise RecordingError(
-                f"{name}: cannot be opened; expected a camera that is plugged in and free (ls "
-                "/dev/video*), or an address that answers"
-            )
+            raise RecordingError(f"{name}: cannot be opened; expected {expected}")
         self._thread = threading.Thread(target=self._follow, name="capture", daemon=True)
         self._thread.start()
 

@@ -143,7 +143,7 @@ def _frames(
     stop: Stop,
     watch: Watch | None,
 ) -> Outcome:
-    start, frames, withheld = time.perf_counter(), 0, 0
+    start, frames, withheld, metric = time.perf_counter(), 0, 0, 0
     origins: Counter[str] = Counter()
 
     def look(frame: SourceFrame) -> None:
@@ -159,6 +159,7 @@ def _frames(
             pushed = Frame(image, frame.stamp, matrix, visible)
             prediction = session.push(pushed)
             withheld += prediction.withheld is not None
+            metric += prediction.metric
             seen = replace(frame, image=image)
             outputs.write(seen, prediction)
             if watch is not None:
@@ -170,10 +171,17 @@ def _frames(
     outcome.warnings.update(dict.fromkeys(session.problems(), 1))
     if withheld:
         outcome.warnings["frames without depth, as their metres are not known yet"] += withheld
+    outcome.notes.append(f"depth: {_unit(frames, metric)}")
     _note(outcome, source, origins, session)
     unread = source.expected is None or frames < source.expected
     outcome.interrupted = stop() and source.live is None and unread
     return outcome
+
+
+def _unit(frames: int, metric: int) -> str:
+    if metric == 0:
+        return "right up to one scale, not in metres"
+    return "in metres" if metric == frames else f"in metres in {metric} of {frames} frames"
 
 
 def _note(

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import cv2
@@ -130,7 +130,8 @@ def _files(path: Path, reading: Reading) -> DepthSource:
     lose: Callable[[str], None] = lambda reason: losses.update([reason])  # noqa: E731
     if path.is_dir():
         frames, count = _folder(path, reading.rate or RATE, lose)
-        return DepthSource("folder", name, path.resolve().parent, frames, count, losses)
+        beside = path.resolve().parent if path.name in ("", "..") else path.parent
+        return DepthSource("folder", name, beside, frames, count, losses)
     if is_picture_name(path):
         image = read_picture(path)
         frames = iter([SourceFrame(image, 0.0, name, path)])
@@ -174,7 +175,8 @@ def _camera(reading: Reading, stopped: Callable[[], bool], capture: Open) -> Dep
         opened.set(cv2.CAP_PROP_FRAME_WIDTH, width)
         opened.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
     number = text if text.isdecimal() else Path(text).name
-    return _live(f"camera {text}", f"camera_{number}", opened, stopped)
+    expected = "one that is plugged in and that no other program reads (ls /dev/video*)"
+    return _live(LiveCapture(f"camera {text}", opened, expected), f"camera_{number}", stopped)
 
 
 def _address(reading: Reading, stopped: Callable[[], bool], capture: Open) -> DepthSource:
@@ -184,14 +186,20 @@ def _address(reading: Reading, stopped: Callable[[], bool], capture: Open) -> De
         raise RecordingError(f"{text}: expected an address such as rtsp://... or http://...")
     host = rest.rpartition("@")[2]  # messages must not show a password
     shown = f"{scheme}://{host}"
-    name = "".join(letter if letter.isalnum() else "_" for letter in host.split("?")[0])
+    path = host.split("?")[0]
     opened = capture(text)
     count = round(opened.get(cv2.CAP_PROP_FRAME_COUNT)) if opened.isOpened() else 0
     if count <= 0:
-        return _live(shown, name, opened, stopped)
+        expected = "an address that answers with a video"
+        return _live(LiveCapture(shown, opened, expected), _file_name(path), stopped)
     losses: Counter[str] = Counter()
     frames = _all_frames(shown, opened, count, lambda reason: losses.update([reason]))
-    return DepthSource("video", name, Path.cwd(), frames, count, losses)
+    name = _file_name(PurePosixPath(path).stem)  # walk of http://host/videos/walk.mp4
+    return DepthSource("video", name, Path(), frames, count, losses)
+
+
+def _file_name(text: str) -> str:
+    return "".join(letter if letter.isalnum() or letter == "-" else "_" for letter in text)
 
 
 def _all_frames(
@@ -211,11 +219,10 @@ def _all_frames(
         lose(f"{name}: {number} of {count} announced frames came")
 
 
-def _live(shown: str, name: str, capture: Capture, stopped: Callable[[], bool]) -> DepthSource:
-    live = LiveCapture(shown, capture)
+def _live(live: LiveCapture, name: str, stopped: Callable[[], bool]) -> DepthSource:
     frames = (
         SourceFrame(image, stamp, f"{number:06d}")
         for number, (image, stamp) in enumerate(live.frames(stopped))
     )
     stamped = f"{name}_{time.strftime('%Y%m%d-%H%M%S')}"
-    return DepthSource("live", stamped, Path.cwd(), frames, None, live=live)
+    return DepthSource("live", stamped, Path(), frames, None, live=live)

@@ -72,6 +72,7 @@ def test_a_video_gets_its_depth_beside_it(
     said = capsys.readouterr()
     assert "3 frames in" in said.out and "walk_depth.mp4" in said.out
     assert "camera: estimated by the model" in said.out
+    assert "depth: right up to one scale, not in metres\n" in said.out
     assert "3/3" in said.err  # progress
 
 
@@ -121,12 +122,15 @@ def test_large_and_portrait_videos(tmp_path: Path, size: tuple[int, int]) -> Non
     assert picture.shape == (height + 44, 2 * width, 3)
 
 
-def test_pictures_give_depth_in_every_format(tmp_path: Path) -> None:
+def test_pictures_give_depth_in_every_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     save(tmp_path / "photos" / "b 2.png", noise(1))
     save(tmp_path / "photos" / "a10.jpg", noise(2))
     formats = ("picture", "png", "npz", "exr", "ply")
     words = ("--out", tmp_path / "out", "--metric-source", "fixed", "--metric-scale", "0.5")
     assert run(tmp_path / "photos", "--write", ",".join(formats), *words) == ALL
+    assert "depth: in metres\n" in capsys.readouterr().out
     out = tmp_path / "out" / "photos_depth"
     names = {kind: sorted(p.stem for p in (out / kind).iterdir()) for kind in formats}
     assert names == {kind: ["a10", "b 2"] for kind in formats}
@@ -155,6 +159,18 @@ def test_a_picture_gives_a_picture(tmp_path: Path) -> None:
         *("photo.jpg", "photo_depth.json", "photo_depth.npz", "photo_depth.png"),
         "photo_depth16.png",
     ]
+
+
+def test_a_folder_named_from_here_is_answered_from_here(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save(tmp_path / "photos" / "a.png", noise(1))
+    monkeypatch.chdir(tmp_path)
+    assert run("photos", "--write", "npz") == ALL
+    assert capsys.readouterr().out.endswith("\nphotos_depth/npz\nphotos_depth.json\n")
+    monkeypatch.chdir("photos")
+    assert run(".", "--write", "npz", "--overwrite") == ALL
+    assert kept(tmp_path) == ["photos/a.png", "photos_depth.json", "photos_depth/npz/a.npz"]
 
 
 def test_depth_too_far_for_16_bits_is_said(
@@ -282,13 +298,21 @@ def test_a_webcam_that_goes_away_keeps_what_it_gave(
     assert np.abs(last - noise(12)[:, :60]).mean() < 12  # the newest was not forgotten
 
 
-@pytest.mark.parametrize("source", ["0", "/dev/video0", "rtsp://user:secret@host/live"])
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("0", "plugged in and that no other program reads"),
+        ("/dev/video0", "plugged in and that no other program reads"),
+        ("rtsp://user:secret@host/live", "an address that answers"),
+    ],
+)
 def test_a_camera_that_is_not_there_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], source: str, expected: str
 ) -> None:
     assert run(source, "--out", tmp_path, capture=lambda name: FakeCamera(0, False)) == UNUSABLE
     said = capsys.readouterr().err
     assert "cannot be opened" in said and said.count("\n") == 1 and "secret" not in said
+    assert expected in said
     assert kept(tmp_path) == []
 
 
@@ -319,6 +343,7 @@ def test_a_video_at_an_address_is_read_whole(tmp_path: Path, served: Callable[[s
     make_video(tmp_path / "walk.mp4", [0, 0.1, 0.2, 0.3], picture=noise)
     assert run(served("walk.mp4"), "--out", tmp_path / "out") == ALL
     (video,) = (tmp_path / "out").iterdir()
+    assert video.name == "walk_depth.mp4"
     assert [time for time, _ in frames_of(video)] == pytest.approx([0, 0.1, 0.2, 0.3], abs=2e-3)
 
 
