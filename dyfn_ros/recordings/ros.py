@@ -87,7 +87,7 @@ class BagRecording:
                     index += 1
                     yield frame
         finally:  # also when no more frames are wanted
-            self.notes.losses.update(self._storage.losses)
+            self.notes.losses.update([*self.topics.lost, *self._storage.losses])
 
     def doubts(self) -> list[str]:
         """See Recording."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from itertools import islice, takewhile
 from pathlib import Path
@@ -31,7 +31,7 @@ _DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$
 _OF_DEPTH = re.compile(r"depth|disparity")
 # A namespace, not the name of a picture.
 _COLOUR_SPACE = re.compile(r"/(?:rgb|colou?r|bgr)[a-z]?_?\d*/")
-_REGISTERED = re.compile(r"aligned|registered")
+_REGISTERED = re.compile(r"aligned|registered|depth_to_(?:rgb|colou?r)")
 _OTHER_LIGHT = re.compile(
     r"infra|thermal|lwir|lepton|boson|flir|optris|temperature|amplitude|intensity|confidence"
     r"|(?:^|[/_])n?ir_?\d*(?:[/_]|$)"
@@ -40,6 +40,8 @@ _SAYS_DEPTH = re.compile(r"depth|range|distance|(?:^|[/_])(?:tof|z)\d*(?:[/_]|$)
 _OF_SDK = re.compile(r"(/device_\d+/sensor_\d+)/Depth_\d+/image/data")
 _RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 WIDE_GREY = {"mono16", *DEPTH_ENCODINGS}  # what shows no colours
+_NO_PICTURE = re.compile(r"(?:8S|16S|32S|32F|64F)C\d+")  # numbers: labels, normals, flow
+_EIGHT_BITS = re.compile(r"(?:rgb|bgr|mono)a?8|8UC\d")
 # Parts of names that say what an image is, not whose.
 _WHAT = re.compile(
     r"(?:rgb|colou?r|bgr|depth|disparity|image|raw|rect(?:ified)?|registered|aligned|to|points?"
@@ -55,6 +57,7 @@ class Topics:
 
     depth: images or clouds; depth_info: the CameraInfo of depth images that have their own.
     remarks: what was chosen by a name or an encoding alone, and what else there is.
+    lost: what cannot be read of the topics that might have been these.
     """
 
     image: str
@@ -62,6 +65,7 @@ class Topics:
     depth: str | None
     depth_info: str | None = None
     remarks: tuple[str, ...] = field(default=(), compare=False)
+    lost: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def names(self) -> dict[str, str | None]:
@@ -111,6 +115,8 @@ def choose_topics(
     kinds = _kinds(storage)
     found = _classify(storage, kinds)
     visible = [n for n in found.colours if not _OTHER_LIGHT.search(n.lower())] or found.colours
+    pictures = [n for n in visible if not _NO_PICTURE.fullmatch(found.encodings.get(n, ""))]
+    visible = pictures or visible
     coloured = [n for n in visible if found.encodings.get(n) not in WIDE_GREY] or visible
     chosen = _named(path, kinds, image, set(PICTURES)) or _only(path, kinds, coloured, "image")
     if chosen is None:
@@ -125,7 +131,6 @@ def choose_topics(
     )
     info = _optional(path, kinds, camera_info, {CAMERA_INFO}, _infos(kinds, chosen))
     remarks = [] if depth is not None else [*_depth_remarks(found, depths, chosen, truth)]
-    remarks += [f"not used: {text}" for name, text in found.damaged.items() if name != chosen]
     clouds = [name for name, kind in kinds.items() if kind == POINT_CLOUD]
     if truth is None and depth is None and clouds:
         remarks.append(f"{', '.join(sorted(clouds))}: ground truth when --depth-topic names it")
@@ -145,19 +150,29 @@ def choose_topics(
         depth=truth,
         depth_info=_optional(path, kinds, depth_info, {CAMERA_INFO}, own),
         remarks=tuple(remarks),
+        lost=() if image and depth else tuple(_lost(found, {chosen, truth})),
     )
+
+
+def _lost(found: _Found, used: Collection[str | None]) -> Iterator[str]:
+    """The images or depth that might have been chosen if they could be read."""
+    for name, text in found.damaged.items():
+        if name not in used:
+            yield f"not used: {text}"
 
 
 def _depth_remarks(
     found: _Found, depths: list[str], image: str, truth: str | None
 ) -> Iterator[str]:
     """What a user should know about the depth topic that was found, or that was not."""
-    if truth is None:
-        for name, held in sorted(found.unread.items()):
+    for name, held in sorted(found.unread.items()):
+        # Beside the truth, a picture of depth is no other candidate.
+        if truth is None or not _EIGHT_BITS.fullmatch(found.encodings.get(name, "rgb8")):
             yield (
                 f"{name} is of depth by its name, and is not used: it holds {held}; expected "
                 "16UC1, 32FC1, mono16, a 16-bit PNG or compressedDepth"
             )
+    if truth is None:
         return
     others = ", ".join(name for name in depths if name != truth)
     if others:
@@ -387,15 +402,19 @@ def _first(storage: Storage, name: str) -> Any:
 
 
 def _nearest(depths: list[str], image: str) -> list[str]:
-    """Of the depths that share most namespaces with the image: the one in the image's own, else the
-    one that is registered by its name, else all."""
+    """Of the depths of the image's device, those that share most namespaces with it: the one in the
+    image's own, else the one that is registered by its name, else that says depth, else all."""
+    whose = _whose(image)
+    own = [name for name in depths if whose and _whose(name)[: len(whose)] == whose]
+    depths = own or depths
     parts = image.split("/")[:-1]
     shared = {name: _shared(parts, name.split("/")[:-1]) for name in depths}
     depths = [name for name in depths if shared[name] == max(shared.values())]
     space = TRANSPORTS.sub("", image).rsplit("/", 1)[0] + "/"
     near = [name for name in depths if name.startswith(space)]
     registered = [name for name in depths if _REGISTERED.search(name.lower())]
-    return next((found for found in (near, registered) if len(found) == 1), depths)
+    named = [name for name in depths if _SAYS_DEPTH.search(name.lower())]
+    return next((found for found in (near, registered, named) if len(found) == 1), depths)
 
 
 def _shared(one: list[str], other: list[str]) -> int:

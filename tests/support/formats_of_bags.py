@@ -513,6 +513,37 @@ BAGS: dict[str, Maker] = {
             *truths("/rear/depth/image", pixels=lambda i: 2 * millimetres(i)),
         ]
     ),
+    "the same with the cameras' namespaces below `/depth`": of(
+        lambda: [
+            *colours("/camera/front/image"),
+            *truths("/depth/front/image"),
+            *truths("/depth/rear/image", pixels=lambda i: 2 * millimetres(i)),
+        ]
+    ),
+    "Azure Kinect: `/depth_to_rgb` beside `/depth`": of(
+        lambda: [
+            *colours("/rgb/image_raw"),
+            *truths("/depth_to_rgb/image_raw"),
+            *truths("/depth/image_raw", pixels=lambda i: 2 * millimetres(i)),
+        ]
+    ),
+    "depth beside labels of 16 bits": of(
+        lambda: [*colours(), *truths(), *truths("/cam/labels", pixels=lambda i: 2 * millimetres(i))]
+    ),
+    "depth beside depth as 64FC1": of(
+        lambda: [
+            *colours(),
+            *truths(),
+            *truths("/cam/depth/exact", "64FC1", lambda i: depth(i).astype(np.float64)),
+        ]
+    ),
+    "colour beside optical flow (32FC2), labels (32SC1)": of(
+        lambda: [
+            *whole(),
+            *truths("/cam/flow", "32FC2", lambda i: np.dstack([depth(i), depth(i)])),
+            *truths("/cam/labels", "32SC1", lambda i: millimetres(i).astype(np.int32)),
+        ]
+    ),
     "the only depth in another camera's namespace": of(
         lambda: [*colours("/front/color/image"), *truths("/rear/depth/image")]
     ),

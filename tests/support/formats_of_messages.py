@@ -84,11 +84,14 @@ def gzipped(folder: Path) -> Path:
 
 
 def serialised(
-    folder: Path, change: Callable[[Event, bytes], bytes], little_endian: bool = True
+    folder: Path,
+    change: Callable[[Event, bytes], bytes],
+    little_endian: bool = True,
+    events: Callable[[], list[Event]] = whole,
 ) -> Path:
     """A rosbag2 folder of messages whose bytes are changed."""
     with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for event in whole():
+        for event in events():
             key = event.topic, event.kind
             known = {(c.topic, c.msgtype): c for c in writer.connections}
             connection = known.get(key) or writer.add_connection(*key, typestore=TYPES)
@@ -155,6 +158,16 @@ def uncalibrated() -> list[Event]:
 def cut_depth(folder: Path) -> Path:
     """Of each message of depth only the beginning is there."""
     return serialised(folder, lambda event, data: data[:30] if event.topic == TRUTH else data)
+
+
+def cut_other_depth(folder: Path) -> Path:
+    """The same of another topic of depth, beside one that can be read."""
+    other = "/cam/depth/second"
+    return serialised(
+        folder,
+        lambda event, data: data[:30] if event.topic == other else data,
+        events=lambda: [*whole(), *truths(other)],
+    )
 
 
 def other_cdr(folder: Path) -> Path:
@@ -230,6 +243,7 @@ MESSAGES: dict[str, Maker] = {
     "CameraInfo with binning": of(binned),
     "CameraInfo with K all 0": of(uncalibrated),
     "depth whose messages cannot be read": cut_depth,
+    "the same beside depth that can be read": cut_other_depth,
     "PointCloud2 and no depth image": of(lambda: [*colours(), *clouds()]),
     "RealSense SDK, depth in tenths of millimetres": realsense,
 }

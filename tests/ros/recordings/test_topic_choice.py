@@ -21,6 +21,8 @@ from dyfn_ros.recordings.typestore import (
     image_message,
 )
 from dyfn_ros.recordings.writer import RecordingWriter
+from tests.support.formats_of_bags import COLOUR, TRUTH
+from tests.support.formats_of_messages import cut_other_depth
 from tests.support.made_recordings import ROS1, ros1_bytes
 from tests.support.numbered import CAMERA, SECOND, SIZE, depth, numbers, picture
 
@@ -203,3 +205,16 @@ def test_topics_without_messages_are_named(
     recording = open_recording(tmp_path / "bag")
     assert numbers(recording.frames()) == [None]
     assert any(said.replace("\\", "") in text for text in recording.notes.warnings)
+
+
+@pytest.mark.parametrize(("named", "lost"), [(False, True), (True, False)])
+def test_depth_that_cannot_be_read_costs_nothing_of_the_other(
+    tmp_path: Path, named: bool, lost: bool
+) -> None:
+    path = cut_other_depth(tmp_path)
+    topics = (COLOUR, None, TRUTH) if named else (None, None, None)
+    recording = open_recording(path, *topics)
+    assert numbers([*recording.frames()]) == [*range(COUNT)]
+    assert recording.topics.depth == TRUTH
+    found = [text for text in recording.notes.losses if "/cam/depth/second" in text]
+    assert bool(found) == lost
