@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import socket
+import sys
 import sysconfig
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,6 +22,8 @@ from dyfn_ros.depth.source import SourceFrame
 from dyfn_ros.replay.rerun import RerunFile, load_rerun, log_frame
 
 APPLICATION = "dyfn_depth"
+_PORT = 9876  # of the viewer
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 SHOWN = 960  # pixels of the longer side of what the viewer gets
 PATIENCE = 20.0  # seconds for the viewer to answer
 MEMORY = "2GB"  # that the viewer keeps; older frames go
@@ -101,6 +105,13 @@ def _own_commands() -> Iterator[None]:
         os.environ["PATH"] = before
 
 
+def _running() -> bool:
+    """Whether a viewer is there already, which then shows the run."""
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex(("127.0.0.1", _PORT)) == 0
+
+
 class LiveView(_View):
     """A viewer's window, which stays open when the run ends.
 
@@ -118,10 +129,15 @@ class LiveView(_View):
             OutputError: It cannot be opened, or does not answer, as without a display.
         """
         rerun = load_rerun()
+        if sys.platform == "linux" and not any(map(os.environ.get, _DISPLAYS)) and not _running():
+            raise OutputError(
+                f"--view: the Rerun viewer needs a display, and none of {', '.join(_DISPLAYS)} is "
+                "set; `--write rrd` makes a file for a viewer elsewhere"
+            )
         recording = rerun.RecordingStream(APPLICATION, recording_id=name)
         try:
             with _own_commands():
-                recording.spawn(memory_limit=MEMORY, default_blueprint=blueprint(rerun))
+                recording.spawn(port=_PORT, memory_limit=MEMORY, default_blueprint=blueprint(rerun))
             recording.flush(timeout_sec=PATIENCE)
         except (OSError, RuntimeError) as error:
             reason = str(error).splitlines()[0]

@@ -76,6 +76,8 @@ class StreamDepthNode(LifecycleNode):
         self._cameras: list[Camera] = []
         self._made: list[Callable[[], Any]] = []  # what cleanup undoes
         self._table = NodeParameters(self, lambda: self._phase != "unconfigured")
+        for text in self._table.unused():
+            self.get_logger().warning(text)
         given = self.settings.state_file  # what is set later must not choose the folder
         self._state_folder = str(Path(given).expanduser().parent) if given else ""
         self._files = FileWork()

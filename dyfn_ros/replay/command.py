@@ -61,7 +61,8 @@ def _replay_and_tell(job: ReplayJob, loader: ModelLoader) -> int:
             print(f"dyfn-replay: {word}: {text}{times}", file=sys.stderr)
     for text in metrics["warnings"]:
         print(f"dyfn-replay: implausible: {text}", file=sys.stderr)
-    print(f"{metrics['frames']} frames of {job.source.recording}")
+    count = metrics["frames"]
+    print(f"{count} frame{'' if count == 1 else 's'} of {job.source.recording}")
     for text in metrics.get("state", {}).values():
         print(f"state: {text}")
     print(text_table(score_table(results_by_name(metrics))))

@@ -92,6 +92,12 @@ def check_cameras(names: Sequence[str]) -> str:
     return ""
 
 
+def _no_such(name: str) -> str:
+    near = difflib.get_close_matches(name[:100], SPECS, 1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    return f"there is no parameter {quoted(name)}{hint}"
+
+
 class NodeParameters:
     """Declares the table on a node and keeps the settings up to date.
 
@@ -122,6 +128,24 @@ class NodeParameters:
     def camera(self, name: str) -> NodeSettings:
         """The settings of one camera."""
         return self._by_camera[name]
+
+    def unused(self) -> list[str]:
+        """Why what was given at start has no effect: ROS passes over names that it does not know.
+
+        Overrides of QoS are not looked at: see NodeTopics.unused_overrides.
+        """
+        found = []
+        for name in self._node._parameter_overrides:
+            if self._node.has_parameter(name) or name.startswith("qos_overrides."):
+                continue
+            camera, _, own = name.partition(".")
+            if own in SPECS:
+                listed = [one for one in self.settings.cameras if one]
+                reason = f"there is no camera {quoted(camera)}; cameras is {listed}"
+            else:
+                reason = _no_such(name)
+            found.append(f"{name} was given and has no effect: {reason}")
+        return found
 
     def set(
         self,
@@ -158,9 +182,7 @@ class NodeParameters:
             if not name:
                 return "a parameter without a name"
             if not self._node.has_parameter(name) and not self._is_new(name):
-                near = difflib.get_close_matches(name[:100], SPECS, 1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                return f"there is no parameter {quoted(name)}{hint}"
+                return _no_such(name)
             if kind == Parameter.Type.NOT_SET:
                 return f"{name} is given without a value"
         return ""

@@ -15,6 +15,7 @@ import zstandard
 
 from dyfn_core.data.files import hidden
 from dyfn_ros.recordings.errors import RecordingError
+from dyfn_ros.recordings.pictures import is_picture_name
 from dyfn_ros.recordings.storage.base import DAMAGE, Recorded, Storage, Topic, reason
 from dyfn_ros.recordings.storage.heads import NAMES, kind_by_head, strange_head
 from dyfn_ros.recordings.storage.mcap import McapFile
@@ -310,6 +311,8 @@ def _open_file(path: Path) -> Storage:
     suffix = kind_by_head(path, packed) or own
     if not _is_file(path):
         hint = f"; it begins as {NAMES[suffix]} does: name it so" if suffix in NAMES else ""
+        if is_picture_name(path):
+            hint = f"; depth of one picture: dyfn-depth {path}"
         raise RecordingError(f"{path}: expected {EXPECTED}{hint}")
     if packed and suffix == own:
         return UnpackedStorage(path)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
+import sys
 from collections.abc import Callable
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -20,6 +22,7 @@ import yaml
 from PIL import Image
 
 from dyfn_core.data.files import read_exr, read_uint16
+from dyfn_ros.depth import view
 from dyfn_ros.depth.cli import ALL, INTERRUPTED, PARTIAL, UNUSABLE, main
 from dyfn_ros.recordings.pictures import DIAGONAL_35MM, EXIF_IFD
 from tests.support.made_videos import make_video, turn_right
@@ -418,7 +421,9 @@ def test_the_viewer_gets_image_depth_points_and_scale(
     rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
     shown = tmp_path / "shown.rrd"
 
-    def into_file(self: Any, *, default_blueprint: Any, memory_limit: str) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+
+    def into_file(self: Any, *, default_blueprint: Any, **_: Any) -> None:
         self.save(shown, default_blueprint=default_blueprint)
 
     monkeypatch.setattr(rerun.RecordingStream, "spawn", into_file)
@@ -428,6 +433,30 @@ def test_the_viewer_gets_image_depth_points_and_scale(
     scale = "median_depth" if metric == "none" else "median_depth_m"
     expected = {"/camera", "/camera/image", "/camera/depth", "/points", f"/scores/{scale}"}
     assert expected <= entities(shown) and expected <= entities(tmp_path / "v_depth.rrd")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have a display")
+def test_a_viewer_without_a_display_is_refused_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rerun = pytest.importorskip("rerun", reason="the extra `rerun` is not installed")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda self, **_: pytest.fail("opened"))
+    make_video(tmp_path / "v.mp4", [0, 0.1])
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        monkeypatch.setattr(view, "_PORT", server.getsockname()[1])
+        assert run(tmp_path / "v.mp4", "--view") == UNUSABLE
+        assert "needs a display" in capsys.readouterr().err
+        assert kept(tmp_path) == ["v.mp4"]
+        spawned: list[int] = []  # a viewer that is there already needs no display here
+        spawn = lambda self, *, port, **_: spawned.append(port)  # noqa: E731
+        monkeypatch.setattr(rerun.RecordingStream, "spawn", spawn)
+        monkeypatch.setattr(rerun.RecordingStream, "flush", lambda self, **_: None)
+        server.listen()
+        assert run(tmp_path / "v.mp4", "--view") == ALL
+        assert spawned == [server.getsockname()[1]]
 
 
 def test_a_viewer_that_is_closed_does_not_end_the_run(
@@ -440,6 +469,7 @@ def test_a_viewer_that_is_closed_does_not_end_the_run(
         if not next(answers, False):
             raise RuntimeError("no connection\nand details")
 
+    monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda self, **_: None)
     monkeypatch.setattr(rerun.RecordingStream, "flush", flush)
     make_video(tmp_path / "v.mp4", [0, 0.1])

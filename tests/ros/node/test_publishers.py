@@ -219,11 +219,13 @@ def test_frames_that_wait_for_a_camera_info_are_a_warning(start: Start) -> None:
     assert not probe.received["depth/image"]
 
 
-def test_the_log_says_what_is_waited_for_and_which_override_is_without_effect(
+def test_the_log_says_what_is_waited_for_and_which_parameter_is_without_effect(
     start: Start,
 ) -> None:
     node, _ = start(
         **{
+            "metric_sorce": "odometry",
+            "front.max_depth": 3.0,
             "qos_overrides./imgae.subscription.depth": 3,
             "qos_overrides./image.subscription.colour": "red",
             "qos_overrides./image.subscription.depth": 3,
@@ -233,3 +235,9 @@ def test_the_log_says_what_is_waited_for_and_which_override_is_without_effect(
     for name in ("/imgae.subscription.depth", "/image.subscription.colour"):
         node.wait_log(rf"WARN\].*qos_overrides.{name} was given, but .* it has no effect")
     assert "/image.subscription.depth was given" not in node.log
+    for name, reason in (
+        ("metric_sorce", "there is no parameter 'metric_sorce'; did you mean 'metric_source'?"),
+        ("front.max_depth", "there is no camera 'front'; cameras is []"),
+    ):
+        assert f"{name} was given and has no effect: {reason}" in node.log
+    assert node.log.count("was given and has no effect") == 2

@@ -176,6 +176,7 @@ def test_what_is_no_recording_is_told_for_what_it_is(
         ("download", b"<html><body>Sign in</body></html>", "but a web page, it begins with"),
         ("walk", b"\x89MCAP0\r\n" + bytes(100), "it begins as an MCAP file does: name it so"),
         ("walk.rosbag", b"#ROSBAG V2.0\n" + bytes(9), "it begins as a ROS 1 bag .2.0. does"),
+        ("photo.jpg", b"any", "a folder of pictures; depth of one picture: dyfn-depth .*photo.jpg"),
         ("walk.dat", b"some text", "expected a rosbag2 folder, an .mcap, .db3 or .bag file"),
         ("walk.mcap", b"", "walk.mcap is empty"),
     ],
