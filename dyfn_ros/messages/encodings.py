@@ -14,6 +14,7 @@ import numpy as np
 
 FULL_BITS = 16
 FULL = (1 << FULL_BITS) - 1  # of 16-bit depth: beyond what can be said, or a word for none
+_OF_TWELVE_BITS = 4095 // 257  # what is left of them when 16 bits become 8
 _SHOWN = 40  # characters of a name that a message made up
 
 
@@ -95,6 +96,19 @@ def to_uint8(pixels: np.ndarray, bits: int = FULL_BITS) -> np.ndarray:
         scaled: np.ndarray = ((values * 255 + most // 2) // most).astype(np.uint8)
         return scaled
     return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def doubted_bits(encoding: str, image: np.ndarray, bits: int = FULL_BITS) -> str:
+    """Drivers put 10 or 12 bits into 16-bit encodings, whose pictures are then dark.
+
+    encoding: or the format of a CompressedImage, whose JPEGs have 8 bits.
+    image: H x W x 3 uint8 as it was decoded. bits: that its values were taken to have.
+    -> what is doubted, empty for nothing.
+    """
+    wide = "16" in encoding and "jpeg" not in encoding
+    if bits != FULL_BITS or not wide or not 0 < image.max() <= _OF_TWELVE_BITS:
+        return ""
+    return f"the values of {quoted(encoding)} are below 4096 of 65536; if the camera gives 12 bits"
 
 
 def _decode_packed(raster: Raster, kind: str, channels: int, to_rgb: int | None) -> np.ndarray:

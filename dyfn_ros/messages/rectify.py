@@ -38,16 +38,11 @@ class PinholeImage:
 
 @dataclass(frozen=True)
 class RectifyRules:
-    """See the node's parameters of the same names.
-
-    refuse_unknown_lens: whether an image is an error whose lens model cannot be undone; else it
-    goes on as it is, without intrinsics.
-    """
+    """See the node's parameters of the same names."""
 
     rectified: bool = False
     distortion: str = "undistort"
     check_frame_id: bool = True
-    refuse_unknown_lens: bool = True
 
 
 class Rectifier:
@@ -66,9 +61,8 @@ class Rectifier:
     ) -> PinholeImage:
         """info: sensor_msgs/CameraInfo, or None.
 
-        Raises MessageError when the lens is distorted and that is refused, LensError when it is of
-        a model that cannot be undone and that is refused. Another unusable info costs the
-        intrinsics only, and a warning.
+        Raises MessageError when the lens is distorted and that is refused. An unusable info, also
+        one of a lens that cannot be undone, costs the intrinsics only, and a warning.
         """
         if info is None:
             return PinholeImage(image)
@@ -91,8 +85,6 @@ class Rectifier:
         try:
             flat = self._undistorted(image, calibration)
         except LensError as error:
-            if rules.refuse_unknown_lens:
-                raise
             self._warn(f"{error}; going on without intrinsics")
             return PinholeImage(image)
         if flat.visible is not None and flat.visible.mean() < _LEAST_VISIBLE:

@@ -17,7 +17,7 @@ from dyfn_core.stream.depth_stream import DepthStream
 from dyfn_core.stream.saving import StateError, check_folder, path_for
 from dyfn_core.stream.session import ResetRequest, StreamSession
 from dyfn_ros.messages.compressed_image import decode_compressed
-from dyfn_ros.messages.encodings import FULL_BITS, quoted
+from dyfn_ros.messages.encodings import doubted_bits
 from dyfn_ros.messages.images import MessageError, decode_image
 from dyfn_ros.messages.rectify import Rectifier, RectifyRules
 from dyfn_ros.node.metric_scale import ScaleTopics
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from dyfn_core.models.base import GeometryModel
 
 _SENSOR_DEPTH = 5
-_OF_TWELVE_BITS = 4095 // 257  # what is left of them when 16 bits become 8
 _LOOK_TIME = 0.1  # seconds before each frame for looks at the dropped ones
 
 Say = Callable[[str], None]
@@ -259,7 +258,9 @@ class Camera:
             image = decode_compressed(job.message, most, settings.image_bits, self._damaged)
         else:
             image = decode_image(job.message, most, settings.image_bits)
-            self._look_at_bits(str(job.message.encoding), image, settings.image_bits)
+        kind = str(job.message.format if compressed else job.message.encoding)
+        if doubt := doubted_bits(kind, image, settings.image_bits):
+            self._warn(f"{self.image_topic}: {doubt}, set image_bits:=12")
         header = job.message.header
         view = self._calibrator.view(
             image,
@@ -269,7 +270,6 @@ class Camera:
                 settings.rectified,
                 settings.distortion,
                 settings.check_frame_id,
-                refuse_unknown_lens=False,
             ),
         )
         frame = Frame(
@@ -284,14 +284,6 @@ class Camera:
     def _damaged(self, text: str) -> None:
         self.statistics.count("damaged")
         self._warn(f"{self.image_topic}: {text}")
-
-    def _look_at_bits(self, encoding: str, image: np.ndarray, bits: int) -> None:
-        """Drivers put 10 or 12 bits into 16-bit encodings, whose pictures are then dark."""
-        if bits == FULL_BITS and "16" in encoding and 0 < image.max() <= _OF_TWELVE_BITS:
-            self._warn(
-                f"{self.image_topic}: the values of {quoted(encoding)} are below 4096 of 65536; if "
-                "the camera gives 12 bits, set image_bits:=12"
-            )
 
     def begin(self, job: FrameJob, frame: Frame) -> DepthStream:
         """-> the DepthStream that the frame goes into."""

@@ -7,6 +7,7 @@ from typing import Literal
 
 from dyfn_core.data.rgbd.layouts import FolderOptions
 from dyfn_core.prediction import DEPTH
+from dyfn_ros.messages.encodings import FULL_BITS
 from dyfn_ros.messages.references import Transform, parse_pose
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import RecordedFrame, Recording
@@ -46,6 +47,7 @@ def open_recording(
     quantity: str = DEPTH,
     depth_scale: float | None = None,
     depth_offset: float = 0.0,
+    image_bits: int = FULL_BITS,
 ) -> Recording:
     """Open a rosbag2 folder, a bare .mcap, .db3 or .bag file, an RGB-D folder, a video file or a
     folder of pictures.
@@ -58,6 +60,7 @@ def open_recording(
     quantity: what the depth topic's images hold, see GroundTruth. depth_scale: stored depth values
     per metre; None: as the encoding or the folder's layout says. depth_offset: seconds by which
     the depth's stamps are after those of images of the same moment, which is taken away.
+    image_bits: that the values of 16-bit images have.
     Raises RecordingError: not a recording, nothing readable, no image topic, or several
     candidates, which are then listed with their types; ValueError for wrong options.
     """
@@ -78,7 +81,16 @@ def open_recording(
     _check_depth(path, storage, topics, transform, quantity)
     depth_scale = depth_scale or realsense_scale(storage, topics.depth)
     return BagRecording(
-        path, storage, topics, tolerance, transform, stamps, quantity, depth_scale, depth_offset
+        path,
+        storage,
+        topics,
+        tolerance,
+        transform,
+        stamps,
+        quantity,
+        depth_scale,
+        depth_offset,
+        image_bits,
     )
 
 

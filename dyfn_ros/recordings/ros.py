@@ -13,9 +13,9 @@ import numpy as np
 
 from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.compressed_image import decode_compressed
-from dyfn_ros.messages.encodings import MessageError
+from dyfn_ros.messages.encodings import FULL_BITS, MessageError, doubted_bits
 from dyfn_ros.messages.images import decode_image
-from dyfn_ros.messages.rectify import LensError, PinholeImage, Rectifier, RectifyRules
+from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
 from dyfn_ros.messages.references import Transform
 from dyfn_ros.recordings.clocks import StampedTimes, clock_offset, offset_text, side_of
 from dyfn_ros.recordings.depth_matching import (
@@ -49,6 +49,7 @@ class BagRecording:
         quantity: str = DEPTH,
         depth_scale: float | None = None,
         depth_offset: float = 0.0,
+        image_bits: int = FULL_BITS,
     ) -> None:
         self.path = path
         self.topics = topics
@@ -59,6 +60,7 @@ class BagRecording:
         self._truth = GroundTruth(transform, self._assumed, quantity, depth_scale)
         self._log_time = stamps == "log"
         self._depth_offset_ns = round(depth_offset * 1e9)
+        self._image_bits = image_bits
         self._matched = 0  # images with a depth
         self._offsets: list[int] = []  # of the nearest depth beyond the tolerance, ns
         self._image_times, self._depth_times = StampedTimes(), StampedTimes()
@@ -221,14 +223,11 @@ class BagRecording:
         image = match.image
         message = image.recorded.message()
         frame_id = str(message.header.frame_id)
-        compressed = image.recorded.kind == COMPRESSED_IMAGE
         try:
-            pixels = decode_compressed(message) if compressed else decode_image(message)
+            pixels = self._pixels(image.recorded, message)
             view = calibrator.view(pixels, frame_id, infos.message(), self._rules)
         except MessageError as error:
-            way = "; --camera-info-topic none takes the images as they are"
-            text = f"{error}{way if isinstance(error, LensError) else ''}"
-            self.notes.losses[f"{image.recorded.topic}: image skipped: {text}"] += 1
+            self.notes.losses[f"{image.recorded.topic}: image skipped: {error}"] += 1
             return None
         return RecordedFrame(
             index=index,
@@ -242,6 +241,20 @@ class BagRecording:
             visible=view.visible,
             lens_undone=view.lens is not None,
         )
+
+    def _pixels(self, recorded: Recorded, message: Any) -> np.ndarray:
+        bits = self._image_bits
+
+        def damaged(text: str) -> None:
+            self.notes.warnings[f"{recorded.topic}: {text}"] += 1
+
+        if recorded.kind == COMPRESSED_IMAGE:
+            kind, pixels = message.format, decode_compressed(message, bits=bits, damaged=damaged)
+        else:
+            kind, pixels = message.encoding, decode_image(message, bits=bits)
+        if doubt := doubted_bits(str(kind), pixels, bits):
+            self.notes.warnings[f"{recorded.topic}: {doubt}, give --image-bits 12"] += 1
+        return pixels
 
     def _decode_depth(
         self, match: Match, info: Any, view: PinholeImage, frame_id: str

@@ -187,6 +187,15 @@ def _add_source(group: Options) -> None:
         help='its CameraInfo; "none" for unknown intrinsics (default: found by type)',
     )
     add(
+        "--image-bits",
+        type=int,
+        choices=range(8, 17),
+        default=16,
+        metavar="BITS",
+        help="bits that the values of 16-bit encodings (mono16, bayer_rggb16, ...) have, 8 to 16: "
+        "12 for a camera of 12 bits whose values are not shifted up (default: 16)",
+    )
+    add(
         "--depth-topic",
         metavar="TOPIC",
         help='ground truth: depth images (16UC1 mm, 32FC1 m, compressed) or a PointCloud2; "none" '

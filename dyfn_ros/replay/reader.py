@@ -98,6 +98,7 @@ class SourceReader:
             quantity=quantity,
             depth_scale=source.depth_scale,
             depth_offset=source.depth_offset,
+            image_bits=source.image_bits,
         )
         available = math.ceil(self.recording.expected_frames / source.stride)
         self.expected = min(available, source.max_frames or available)

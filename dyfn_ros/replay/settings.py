@@ -46,6 +46,7 @@ class Source:
         depth_scale: Stored depth values per metre; None: as the encoding or the layout says.
         depth_offset: Seconds that the depth's stamps are after those of the images.
         depth_transform: Its pose in the image's optical frame, 'x y z qx qy qz qw', metres.
+        image_bits: That the values of 16-bit images have.
         reference_topic: Measurements for metric_source "reference"; None: found by type.
         odometry_topic: Poses for metric_source "odometry", see recordings.poses.PoseTopic.
         odometry_offset: Seconds that their stamps are after those of the images.
@@ -64,6 +65,7 @@ class Source:
     depth_transform: str | None = None
     depth_scale: float | None = None
     depth_offset: float = 0.0
+    image_bits: int = 16
     reference_topic: str | None = None
     odometry_topic: str | None = None
     odometry_offset: float = 0.0

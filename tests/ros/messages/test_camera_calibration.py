@@ -104,11 +104,15 @@ def test_distortion_can_be_refused_or_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "count"), [("ellipsoidal", 4), ("equidistant", 5), ("plumb_bob", 3)]
+    ("model", "count"), [("ellipsoidal", 4), ("equidistant", 5), ("plumb_bob", 3), ("ocam", 2)]
 )
-def test_a_lens_that_is_not_known_is_refused_by_name(model: str, count: int) -> None:
-    with pytest.raises(MessageError, match=f"'{model}' with {count} coefficients cannot be undone"):
-        view(info(model, [0.1] * count))
+def test_a_lens_that_is_not_known_costs_the_intrinsics_by_name(model: str, count: int) -> None:
+    message = info(model, [0.1] * count)
+    found, warnings = view(message)
+    assert (found.matrix, found.info, found.visible) == (None, None, None)
+    assert f"'{model}' with {count} coefficients cannot be undone" in warnings[0]
+    with pytest.raises(MessageError, match="parameter distortion is refuse"):
+        view(message, distortion="refuse")
 
 
 @pytest.mark.parametrize(
@@ -163,14 +167,6 @@ def test_nonsense_costs_the_intrinsics_and_is_said(change: dict[str, Any], reaso
     assert found.matrix is None and found.visible is None
     np.testing.assert_array_equal(found.image, image)
     assert len(said) == 1 and reason in said[0]
-
-
-def test_an_unknown_lens_may_cost_the_intrinsics_only() -> None:
-    found, warnings = view(info("ocam", [0.1, 0.2]), refuse_unknown_lens=False)
-    assert (found.matrix, found.info, found.visible) == (None, None, None)
-    assert "'ocam' with 2 coefficients cannot be undone" in warnings[0]
-    with pytest.raises(MessageError, match="parameter distortion is refuse"):
-        view(info("ocam", [0.1, 0.2]), refuse_unknown_lens=False, distortion="refuse")
 
 
 @pytest.mark.parametrize("size", [(30, 40), (15, 20), (20, 26), (1, 1)])

@@ -89,16 +89,19 @@ def test_other_names_of_a_lens_are_the_same_lens(tmp_path: Path, name: str, know
         ("inverse_brown_conrady", (0.1, 0, 0, 0, 0)),
     ],
 )
-def test_an_unknown_lens_names_the_way_on(
+def test_an_unknown_lens_costs_the_intrinsics_only_as_in_the_node(
     tmp_path: Path, name: str, coefficients: tuple[float, ...]
 ) -> None:
     recording = write(tmp_path / "bag", Lens(name, coefficients))
-    assert not list(recording.frames())
-    ((text, count),) = recording.notes.losses.items()
-    assert count == COUNT and "cannot be undone; known: plumb_bob (radtan), " in text
-    assert text.endswith("; --camera-info-topic none takes the images as they are")
+    found = list(recording.frames())
+    assert not recording.notes.losses
+    (text,) = recording.notes.warnings
+    assert "cannot be undone; known: plumb_bob (radtan), " in text
+    assert text.endswith("; going on without intrinsics")
     without = open_recording(tmp_path / "bag", camera_info_topic="none")
-    assert [frame.camera_matrix for frame in without.frames()] == [None] * COUNT
+    for one, other in zip(found, without.frames(), strict=True):
+        assert one.camera_matrix is None and other.camera_matrix is None
+        np.testing.assert_array_equal(one.image, other.image)
 
 
 @pytest.mark.parametrize(

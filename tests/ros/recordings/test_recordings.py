@@ -318,3 +318,38 @@ def test_missing_and_empty_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").unlink()
     with pytest.raises(RecordingError, match="expected colour images"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("packed", [False, True], ids=["raw", "png"])
+def test_twelve_bits_in_sixteen_are_said_and_can_be_told(tmp_path: Path, packed: bool) -> None:
+    eight = picture(0)[..., 0]
+    twelve = np.rint(eight * (4095 / 255)).astype(np.uint16)
+    with RecordingWriter(tmp_path / "bag") as writer:
+        if packed:
+            png = cv2.imencode(".png", twelve)[1].reshape(-1)
+            message = compressed_message(png, "mono16; png compressed ", 10**9, "camera")
+            writer.write("/image/compressed", COMPRESSED_IMAGE, message, 10**9)
+        else:
+            writer.write("/image", IMAGE, image_message(twelve, "mono16", 10**9, "camera"), 10**9)
+    name = "/image/compressed" if packed else None  # 16-bit PNGs are taken for depth else
+    dark = open_recording(tmp_path / "bag", name)
+    (frame,) = dark.frames()
+    assert frame.image.max() <= 15
+    ((text, count),) = dark.notes.warnings.items()
+    assert count == 1 and "are below 4096 of 65536" in text and text.endswith("--image-bits 12")
+    told = open_recording(tmp_path / "bag", name, image_bits=12)
+    (frame,) = told.frames()
+    np.testing.assert_array_equal(frame.image[..., 0], eight)
+    assert not told.notes.warnings
+
+
+def test_stray_bytes_in_a_jpeg_are_a_warning(tmp_path: Path) -> None:
+    jpeg = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    data = np.frombuffer(jpeg[:-2] + b"abc" + jpeg[-2:], np.uint8)
+    with RecordingWriter(tmp_path / "bag") as writer:
+        message = compressed_message(data, "jpeg", 10**9, "camera")
+        writer.write("/image/compressed", COMPRESSED_IMAGE, message, 10**9)
+    recording = open_recording(tmp_path / "bag")
+    assert len(list(recording.frames())) == 1 and not recording.notes.losses
+    (text,) = recording.notes.warnings
+    assert "damaged, but whole: Corrupt JPEG data: " in text
