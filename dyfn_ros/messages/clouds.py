@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from dyfn_ros.messages.encodings import MessageError
-from dyfn_ros.messages.images import _bytes, _ros_bytes
+from dyfn_ros.messages.images import _bytes, _octets
 
 # PCL's PointXYZRGB: colour at 16, so that x y z keep four floats to themselves.
 CLOUD_OFFSETS = {"x": 0, "y": 4, "z": 8, "rgb": 16}
@@ -41,13 +41,25 @@ class CloudMemory:
     def __init__(self) -> None:
         self.data = array.array("B")
         self._cloud: np.ndarray = np.empty((0, 0), CLOUD_DTYPE)
+        self._message: Any = None
 
     def cloud(self, shape: tuple[int, ...], dtype: np.dtype[np.void]) -> np.ndarray:
         """H x W of dtype, whose padding is zero and whose points are those of the cloud before."""
         if self._cloud.shape != shape or self._cloud.dtype != dtype:
             self.data = array.array("B", bytes(dtype.itemsize * shape[0] * shape[1]))
             self._cloud = _bytes(self.data).view(dtype).reshape(shape)
+            self._message = None
         return self._cloud
+
+    def message(self, header: Any) -> Any:
+        """The cloud as a PointCloud2 without a copy, the same message while the layout stays."""
+        if self._message is None:
+            self._message = message = _layout_message(self._cloud)
+            message.data.frombytes(self.data)  # its setter may copy, and later clouds go here
+            self.data = message.data
+            self._cloud = _bytes(self.data).view(self._cloud.dtype).reshape(self._cloud.shape)
+        self._message.header = header
+        return self._message
 
 
 def pack_cloud(
@@ -111,9 +123,19 @@ def _fields(dtype: np.dtype[np.void]) -> list[tuple[str, int, int]]:
 def cloud_message(header: Any, cloud: np.ndarray, memory: CloudMemory | None = None) -> Any:
     """-> sensor_msgs.msg.PointCloud2; header as it is.
 
-    cloud: as pack_cloud returns it. memory: that it was packed into; the message then has no copy,
-    and is good as long as the cloud.
+    cloud: as pack_cloud returns it. memory: that it was packed into; the message is then its own,
+    without a copy, and good as long as the cloud.
     """
+    if memory is not None:
+        return memory.message(header)
+    message = _layout_message(cloud)
+    message.header = header
+    message.data.frombytes(_octets(cloud))
+    return message
+
+
+def _layout_message(cloud: np.ndarray) -> Any:
+    """All of a PointCloud2 that does not change from frame to frame."""
     from sensor_msgs.msg import PointCloud2, PointField
 
     height, width = cloud.shape
@@ -122,10 +144,9 @@ def cloud_message(header: Any, cloud: np.ndarray, memory: CloudMemory | None = N
         PointField(name=name, offset=offset, datatype=kind, count=1)
         for name, offset, kind in _fields(cloud.dtype)
     ]
-    message = PointCloud2(header=header, height=height, width=width, fields=fields)
+    message = PointCloud2(height=height, width=width, fields=fields)
     message.point_step = step
     message.row_step = step * width
     message.is_bigendian = False
     message.is_dense = False
-    message.data = _ros_bytes(cloud) if memory is None else memory.data
     return message

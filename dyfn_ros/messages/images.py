@@ -6,7 +6,6 @@ rosbags deserialises. ROS itself is imported only where a message for it is buil
 
 from __future__ import annotations
 
-import array
 from typing import Any
 
 import numpy as np
@@ -96,11 +95,9 @@ def _thousandths(depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(rounded <= 65535, rounded, 0).astype("<u2")
 
 
-def _ros_bytes(values: np.ndarray) -> array.array[int]:
-    """Only an array.array is taken over by rclpy without a look at every element."""
-    data = array.array("B")
-    data.frombytes(np.ascontiguousarray(values).reshape(-1).view(np.uint8).data)
-    return data
+def _octets(values: np.ndarray) -> memoryview:
+    """For `message.data.frombytes`: the setter of `data` may look at, or copy, every element."""
+    return np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
 
 
 def depth_message(
@@ -130,7 +127,10 @@ def _image(header: Any, fields: dict[str, Any]) -> Any:
 
     message = Image(header=header)
     for name, value in fields.items():
-        setattr(message, name, _ros_bytes(value) if name == "data" else value)
+        if name == "data":
+            message.data.frombytes(_octets(value))
+        else:
+            setattr(message, name, value)
     return message
 
 
@@ -139,5 +139,5 @@ def compressed_message(header: Any, layout: str, data: bytes) -> Any:
     from sensor_msgs.msg import CompressedImage
 
     message = CompressedImage(header=header, format=layout)
-    message.data = _ros_bytes(np.frombuffer(data, np.uint8))
+    message.data.frombytes(data)
     return message

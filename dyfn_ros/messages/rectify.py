@@ -55,6 +55,7 @@ class Rectifier:
         self._warn = warn
         self._key: tuple[Any, ...] | None = None
         self._maps: tuple[np.ndarray, np.ndarray, np.ndarray]
+        self._shown = 1.0  # share of the undistorted image
 
     def view(
         self, image: np.ndarray, frame_id: str, info: Any, rules: RectifyRules
@@ -87,9 +88,9 @@ class Rectifier:
         except LensError as error:
             self._warn(f"{error}; going on without intrinsics")
             return PinholeImage(image)
-        if flat.visible is not None and flat.visible.mean() < _LEAST_VISIBLE:
+        if self._shown < _LEAST_VISIBLE:
             self._warn(
-                f"D {list(calibration.d)} of no real lens: {flat.visible.mean():.1%} of the "
+                f"D {list(calibration.d)} of no real lens: {self._shown:.1%} of the "
                 "undistorted image would show something; going on without intrinsics"
             )
             return PinholeImage(image)
@@ -99,6 +100,7 @@ class Rectifier:
         key = (*calibration.matrix.reshape(-1), calibration.model, *calibration.d, *image.shape)
         if key != self._key:
             self._maps = undistortion(calibration, image.shape[0], image.shape[1])
+            self._shown = float(self._maps[2].mean())
             self._key = key
         columns, rows, visible = self._maps
         flat = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

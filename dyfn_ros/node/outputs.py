@@ -98,7 +98,7 @@ class NodeOutputs:
             prediction, image, info = smaller(prediction, image, info, settings.output_scale)
         depth, encoding = prediction.depth, settings.depth_encoding
         valid = in_range(depth, prediction.valid, settings.min_depth, settings.max_depth)
-        share = float(valid.mean())
+        share = np.count_nonzero(valid) / max(valid.size, 1)
         self._valid_ratio.publish(Float32(data=share))
         if settings.publish_depth:
             if self._depth.get_subscription_count():

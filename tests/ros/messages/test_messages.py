@@ -388,6 +388,8 @@ def test_memory_that_held_another_cloud_leaves_nothing_of_it(shape: tuple[int, i
         assert cloud.tobytes() == pack_cloud(points, valid, image, dtype).tobytes()
         message = cloud_message(header(), cloud, memory)
         assert bytes(message.data) == cloud.tobytes()
+        assert message == cloud_message(header(), cloud)
+        assert message.data is memory.data
 
 
 def test_clouds_of_another_layout_are_refused() -> None:
