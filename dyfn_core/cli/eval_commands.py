@@ -38,6 +38,7 @@ from dyfn_core.models.checkpoints import load_model
 from dyfn_core.scoring.protocols import ALL_PIXELS
 
 COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
+ORIGINAL_RATE = 1  # stride of the paper's long sequences, which are consecutive frames
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -98,14 +99,20 @@ def _method(options: argparse.Namespace) -> Method:
     return _model(options) if getattr(options, "model", None) else _files(options)
 
 
-def _open(options: argparse.Namespace, frames: int | None = None) -> Opened:
-    """The benchmark with what the command line overrides."""
+def _open(
+    options: argparse.Namespace, frames: int | None = None, stride: int | None = None
+) -> Opened:
+    """The benchmark with what the command line overrides.
+
+    frames: the most of a sequence; None: by --max-frames or the benchmark. stride: where --stride
+    is not given; None: the benchmark's.
+    """
     known = benchmark(options.benchmark)
     settings = default_settings(known, find_layout(known, options.data, options.layout))
     crop = None if options.crop is None else tuple(options.crop)
     given: dict[str, Any] = {
         "first": options.start,
-        "stride": options.stride,
+        "stride": stride if options.stride is None else options.stride,
         "frames": options.max_frames if frames is None else frames,
         "depth_max": options.depth_max,
         "crop": crop,
@@ -158,7 +165,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _long(options: argparse.Namespace) -> int:
     lengths = options.lengths or LENGTHS
-    opened = _open(options, max(lengths))
+    opened = _open(options, max(lengths), ORIGINAL_RATE)
     results = long_sequences(
         opened,
         _method(options),

@@ -12,6 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dyfn_core.cli.chosen_data import open_sequence, places
+from dyfn_core.cli.fuse_aligned import run_fusion
 from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
 from dyfn_core.evaluation.reconstruction.matching import build_matcher
 from dyfn_core.evaluation.reconstruction.poses import ReconstructionOptions
@@ -42,6 +43,12 @@ COMPLETE, UNUSABLE, PARTIAL = 0, 2, 3
 
 def run(options: argparse.Namespace) -> int:
     """-> exit status. Raises ValueError, DataError or OSError for what is unusable."""
+    if options.fuse_aligned:
+        if not options.with_model:
+            raise ValueError(
+                "--fuse-aligned aligns a model's depth: it does not go with --no-model"
+            )
+        return run_fusion(options, load_model(options.model, options.device, options.backend))
     settings = ReconstructionOptions(
         offsets=tuple(options.offsets),
         threshold=options.threshold,

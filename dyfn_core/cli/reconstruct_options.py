@@ -63,5 +63,11 @@ def add_parser(commands: Commands) -> None:
         default=True,
         help="also rebuild from the true depth, as a bound (default: %(default)s)",
     )
+    add(
+        "--fuse-aligned",
+        action="store_true",
+        help="find no poses: align depth to the truth per frame and per sequence, and fuse it with "
+        "the true poses (figure 2 of the paper)",
+    )
     add("--no-model", dest="with_model", action="store_false", help="true depth alone")
     command.set_defaults(run="reconstruct")

@@ -113,7 +113,7 @@ def reconstruct_sequence(
     frame could be read.
     """
     chosen = options or ReconstructionOptions()
-    streams = {} if model is None else _streams(model, num_tokens)
+    streams = {} if model is None else model_streams(model, num_tokens)
     names = [*([TRUE_DEPTH] if true_depth else []), *streams]
     if not names:
         raise ValueError("nothing to reconstruct from: give a model, or use the true depth")
@@ -134,7 +134,8 @@ def reconstruct_sequence(
     return found
 
 
-def _streams(model: GeometryModel, num_tokens: int | None) -> dict[str, DepthStream]:
+def model_streams(model: GeometryModel, num_tokens: int | None) -> dict[str, DepthStream]:
+    """The runs that a model gives: with its stabilizer, if it has one, and without."""
     ways = {WITH_DYFN: True, BASE: False} if model.stabilizer is not None else {BASE: False}
     return {
         name: DepthStream(model, stabilize=stabilize, num_tokens=num_tokens)
@@ -152,7 +153,8 @@ def _readable(
             losses[str(error)] += 1
 
 
-def _matrix(frame: RgbdFrame) -> np.ndarray:
+def camera_matrix(frame: RgbdFrame) -> np.ndarray:
+    """3 x 3 intrinsics of a frame, normalised."""
     fx, fy, cx, cy = (float(value) for value in frame.intrinsics)
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
@@ -161,11 +163,13 @@ def _true_points(frame: RgbdFrame) -> tuple[np.ndarray, np.ndarray]:
     """H x W x 3 float32 metres, and H x W bool."""
     valid = np.isfinite(frame.depth) & (frame.depth > 0)
     depth = torch.from_numpy(np.where(valid, frame.depth, 0).astype(np.float32))
-    return depth_to_points(depth[None], torch.from_numpy(_matrix(frame))[None])[0].numpy(), valid
+    return depth_to_points(depth[None], torch.from_numpy(camera_matrix(frame))[None])[
+        0
+    ].numpy(), valid
 
 
 def _predicted(stream: DepthStream, frame: RgbdFrame) -> tuple[np.ndarray, np.ndarray]:
-    stream.camera_matrix = pixel_intrinsics(_matrix(frame), frame.image.shape[:2])
+    stream.camera_matrix = pixel_intrinsics(camera_matrix(frame), frame.image.shape[:2])
     prediction = stream.push(frame.image)
     return prediction.points.float().cpu().numpy(), prediction.mask.cpu().numpy()
 

@@ -317,6 +317,20 @@ def test_long_from_the_command_line(tmp_path: Path) -> None:
     assert read(tmp_path / "out")["warnings"] == []
 
 
+@pytest.mark.parametrize(("more", "scored"), [([], 8), (["--stride", "3"], 3)])
+def test_long_takes_the_original_rate(tmp_path: Path, more: list[str], scored: int) -> None:
+    make_scannet(tmp_path / "root", "scene0707_00", 8)
+    (tmp_path / "p").mkdir()
+    np.save(tmp_path / "p/scene0707_00.npy", np.ones((8, 24, 32), np.float32))
+    arguments = ["long", "--benchmark", "scannet", "--data", str(tmp_path / "root"), *more]
+    arguments += ["--predictions", str(tmp_path / "p"), "--out", str(tmp_path / "out")]
+    arguments += ["--lengths", "2", "3", "8", "--allow-missing", "--crop", "0", "0"]
+    assert cli.main(arguments) == 3
+    found = read(tmp_path / "out")
+    assert max(map(int, found["lengths"])) == scored
+    assert found["settings"]["stride"] == (3 if more else 1)
+
+
 def test_long_says_what_is_implausible(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root, folder = room(tmp_path / "root", 3), tmp_path / "drift"
     folder.mkdir()

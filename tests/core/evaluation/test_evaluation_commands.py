@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -193,3 +194,34 @@ def test_a_linear_decoder_turns_statistics_into_scale_and_shift() -> None:
             expected = (mean + 0.5) - (a * mean + 0.5) / b
             assert grid.shift[row, column] * median == pytest.approx(expected, abs=6e-3)
     assert grid.abs_rel.max() < 1e-4
+
+
+def test_fuse_aligned_writes_figure_two(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["reconstruct", str(room), "--out", str(tmp_path), "--fuse-aligned"]) == 0
+    found = json.loads((tmp_path / "fusion.json").read_text())
+    assert found["frames"] == FRAMES and set(found["runs"]) == {"with DyFN", "base model"}
+    for alignments in found["runs"].values():
+        frame, sequence = (alignments[f"per {unit}"] for unit in ("frame", "sequence"))
+        assert frame["depth"]["abs_rel"] < sequence["depth"]["abs_rel"]
+        assert frame["cloud"]["chamfer"] < sequence["cloud"]["chamfer"]
+    printed = capsys.readouterr().out
+    assert printed.count("per frame") == printed.count("per sequence") == 2
+    assert cv2.imread(str(tmp_path / "fusion.png")).std() > 20
+    assert (tmp_path / "cloud_true_depth.ply").stat().st_size > 1000
+    assert (tmp_path / "cloud_base_model_per_sequence.ply").stat().st_size > 1000
+    assert "AbsRel" in (tmp_path / "report.html").read_text()
+    words = ["reconstruct", str(room), "--out", str(tmp_path), "--fuse-aligned", "--no-model"]
+    assert main(words) == 2 and "--no-model" in capsys.readouterr().err
+
+
+def test_fuse_aligned_leaves_out_frames_without_a_pose(room: Path, tmp_path: Path) -> None:
+    poses = (room / "poses.txt").read_text().splitlines()
+    other = tmp_path / "room"
+    shutil.copytree(room, other)
+    poses[3] = " ".join(["nan"] * 16)
+    (other / "poses.txt").write_text("\n".join(poses))
+    assert main(["reconstruct", str(other), "--out", str(tmp_path / "o"), "--fuse-aligned"]) == 3
+    found = json.loads((tmp_path / "o/fusion.json").read_text())
+    assert found["frames"] == FRAMES - 1 and list(found["losses"].values()) == [1]
