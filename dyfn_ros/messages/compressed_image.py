@@ -22,6 +22,8 @@ from dyfn_ros.messages.encodings import (
 from dyfn_ros.messages.jpeg_complaints import harmless, with_complaints
 from dyfn_ros.messages.picture_size import JPEG, MAX_PIXELS, PNG, check_picture_size
 
+# What image_transport puts behind the name of an image.
+TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg)$")
 _LAYOUT = re.compile(
     r"^\s*(?:(?P<encoding>\w+)\s*;\s*)?(?P<codec>\w+)(?:\s+compressed\s*(?P<order>\w*))?"
 )

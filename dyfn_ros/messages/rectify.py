@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,9 +11,18 @@ import cv2
 import numpy as np
 
 from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
+from dyfn_ros.messages.compressed_image import TRANSPORTS
 from dyfn_ros.messages.encodings import MessageError, quoted
 
+_RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 _LEAST_VISIBLE = 0.1  # share of an undistorted image's pixels
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether images are rectified by their topic's name, as image_proc gives it: P of their
+    CameraInfo describes them, and K and D the images that they were made of."""
+    parts = TRANSPORTS.sub("", topic).lower().rsplit("/", 2)
+    return any(_RECTIFIED.search(part) for part in parts[-2:])
 
 
 class LensError(MessageError):

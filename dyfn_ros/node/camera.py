@@ -19,7 +19,7 @@ from dyfn_core.stream.session import ResetRequest, StreamSession
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.encodings import doubted_bits
 from dyfn_ros.messages.images import MessageError, decode_image
-from dyfn_ros.messages.rectify import Rectifier, RectifyRules
+from dyfn_ros.messages.rectify import Rectifier, RectifyRules, is_rectified
 from dyfn_ros.node.metric_scale import ScaleTopics
 from dyfn_ros.node.odometry import OdometryTopic, TransformTopics
 from dyfn_ros.node.outputs import NodeOutputs
@@ -267,7 +267,7 @@ class Camera:
             header.frame_id,
             job.info or self._info,
             RectifyRules(
-                settings.rectified,
+                settings.rectified or is_rectified(self.image_topic),
                 settings.distortion,
                 settings.check_frame_id,
             ),

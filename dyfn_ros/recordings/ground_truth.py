@@ -15,10 +15,9 @@ from dyfn_ros.messages.camera_info import CameraCalibration, decode_camera_info
 from dyfn_ros.messages.compressed_depth import decode_compressed_depth
 from dyfn_ros.messages.encodings import MessageError
 from dyfn_ros.messages.images import decode_depth
-from dyfn_ros.messages.rectify import PinholeImage, undistort_depth
+from dyfn_ros.messages.rectify import PinholeImage, is_rectified, undistort_depth
 from dyfn_ros.messages.references import Transform, decode_points
 from dyfn_ros.recordings.storage.base import Recorded
-from dyfn_ros.recordings.topics import is_rectified
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE, POINT_CLOUD
 
 SAME = 2e-3  # of the image's width and height: intrinsics that differ by less are the same

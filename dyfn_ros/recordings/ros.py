@@ -15,7 +15,7 @@ from dyfn_core.prediction import DEPTH
 from dyfn_ros.messages.compressed_image import decode_compressed
 from dyfn_ros.messages.encodings import FULL_BITS, MessageError, doubted_bits
 from dyfn_ros.messages.images import decode_image
-from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules
+from dyfn_ros.messages.rectify import PinholeImage, Rectifier, RectifyRules, is_rectified
 from dyfn_ros.messages.references import Transform
 from dyfn_ros.recordings.clocks import StampedTimes, clock_offset, offset_text, side_of
 from dyfn_ros.recordings.depth_matching import (
@@ -30,7 +30,7 @@ from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.ground_truth import GroundTruth
 from dyfn_ros.recordings.storage.base import Recorded, Storage
-from dyfn_ros.recordings.topics import Topics, is_rectified, topic_remarks
+from dyfn_ros.recordings.topics import Topics, topic_remarks
 from dyfn_ros.recordings.typestore import COMPRESSED_IMAGE
 from dyfn_ros.recordings.video_topic import VideoTopic, is_video
 

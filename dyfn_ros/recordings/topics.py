@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dyfn_ros.messages.compressed_depth import is_compressed_depth
+from dyfn_ros.messages.compressed_image import TRANSPORTS
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.storage.base import Storage
 from dyfn_ros.recordings.typestore import (
@@ -25,7 +26,6 @@ NONE = "none"  # what a user writes to do without a topic
 DEPTH_ENCODINGS = {"16UC1", "32FC1"}
 PICTURES = (IMAGE, COMPRESSED_IMAGE, COMPRESSED_VIDEO, FFMPEG_PACKET)
 TRIES = 16  # messages of a topic, to see what it holds
-TRANSPORTS = re.compile(r"/(compressed|compressedDepth|ffmpeg)$")
 # Names in lower case. A device that is called after its depth says nothing about its topics.
 _DEVICE = re.compile(r"depth_?(?:cam(?:era)?|sensor|device|module)s?\d*(?=[/_]|$)")
 _OF_DEPTH = re.compile(r"depth|disparity")
@@ -38,7 +38,6 @@ _OTHER_LIGHT = re.compile(
 )
 _SAYS_DEPTH = re.compile(r"depth|range|distance|(?:^|[/_])(?:tof|z)\d*(?:[/_]|$)")
 _OF_SDK = re.compile(r"(/device_\d+/sensor_\d+)/Depth_\d+/image/data")
-_RECTIFIED = re.compile(r"(?:^|_)rect(?:ified)?(?:_|$)")
 WIDE_GREY = {"mono16", *DEPTH_ENCODINGS}  # what shows no colours
 _NO_PICTURE = re.compile(r"(?:8S|16S|32S|32F|64F)C\d+")  # numbers: labels, normals, flow
 _EIGHT_BITS = re.compile(r"(?:rgb|bgr|mono)a?8|8UC\d")
@@ -188,13 +187,6 @@ def _depth_remarks(
             f"{truth} is the only depth, in another namespace than {image}: of another camera? "
             "--depth-topic none does without"
         )
-
-
-def is_rectified(topic: str) -> bool:
-    """Whether images are rectified by their topic's name, as image_proc gives it: P of their
-    CameraInfo describes them, and K and D the images that they were made of."""
-    parts = TRANSPORTS.sub("", topic).lower().rsplit("/", 2)
-    return any(_RECTIFIED.search(part) for part in parts[-2:])
 
 
 def topic_remarks(storage: Storage, topics: Topics) -> list[str]:

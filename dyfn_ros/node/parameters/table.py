@@ -142,7 +142,8 @@ class NodeSettings(OdometryOptions, ReferenceOptions, StreamOptions):
     rectified: bool = _parameter(
         _INPUT,
         False,
-        "The images are rectified: take P of the CameraInfo instead of K and D.",
+        "The images are rectified: take P of the CameraInfo instead of K and D. So are those whose "
+        "topic says so (`image_rect`, `rect/image`).",
         changes=RUN,
         per_camera=True,
     )

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dyfn_ros.messages.rectify import is_rectified
 from dyfn_ros.recordings.open import Recording, open_recording
-from dyfn_ros.recordings.topics import is_rectified
 from dyfn_ros.recordings.typestore import CAMERA_INFO, Lens, camera_info
 from dyfn_ros.recordings.writer import RecordingWriter
 from tests.support.numbered import CAMERA, SECOND, SIZE, depth, numbers, picture
