@@ -17,9 +17,10 @@ def test_the_first_colours_import_no_library(monkeypatch: pytest.MonkeyPatch) ->
     imported: list[str] = []
     load = builtins.__import__
 
-    def noted(name: str, *arguments: Any, **named: Any) -> Any:
-        imported.append(name)
-        return load(name, *arguments, **named)
+    def noted(name: str, *arguments: Any, level: int = 0) -> Any:
+        if not (level or (len(arguments) == 4 and arguments[3])):  # no relative name
+            imported.append(name)
+        return load(name, *arguments, level=level) if level else load(name, *arguments)
 
     monkeypatch.setattr(builtins, "__import__", noted)
     depth = np.linspace(1, 9, 36 * 48).reshape(36, 48)
@@ -28,4 +29,4 @@ def test_the_first_colours_import_no_library(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.undo()
     assert painted.shape == (36, 48, 3) and painted[0, 0].tolist() == [70, 70, 70]
     packages = {name.split(".")[0] for name in imported} - sys.stdlib_module_names
-    assert packages <= {"", "numpy"}
+    assert packages <= {"numpy"}
