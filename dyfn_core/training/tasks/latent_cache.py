@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.progress import track
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from tqdm import tqdm
 
 from dyfn_core.data.clips import ClipBatch, ClipSource, batch_loader
 from dyfn_core.files import finished_file, write_text
@@ -121,7 +121,9 @@ class CacheFolder:
         if not missing:
             return
         batches = batch_loader(source, missing[0], unreadable)
-        for index in track(range(missing[0], share.stop), description=f"making {self.holds}"):
+        wanted = range(missing[0], share.stop)
+        # Not rich's: that shows nothing in a log file until the minutes are over.
+        for index in tqdm(wanted, desc=f"making {self.holds}", unit="batch"):
             batch = next(batches)
             if self._path(index).exists():
                 continue

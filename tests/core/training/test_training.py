@@ -153,11 +153,14 @@ def test_dyfn_run_changes_dyfn_alone(data: Path, base_run: Path, tmp_path: Path)
     assert {"rendered_base_video", "rendered_dyfn_video"} <= set(validation[0])
 
 
-def test_dyfn_run_resumes_from_its_cache(data: Path, base_run: Path, tmp_path: Path) -> None:
+def test_dyfn_run_resumes_from_its_cache(
+    data: Path, base_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = str(dyfn_config(tmp_path, data, base_run))
     whole, halves = tmp_path / "whole", tmp_path / "halves"
     cache = ["--set", f"method.cache={tmp_path / 'latents'}"]
     assert main(["dyfn", config, "--out", str(whole), *cache]) == 0
+    assert "making latents:" in capsys.readouterr().err  # minutes, also in a log file
     assert main(["dyfn", config, "--out", str(halves), *cache, "--max-steps", "2"]) == 0
     assert main(["dyfn", config, "--out", str(halves), *cache, "--resume"]) == 0
     losses = [[line["loss"] for line in read_log(out)] for out in (whole, halves)]
