@@ -1,10 +1,10 @@
-"""dyfn-export: a model's pure step as an ONNX file."""
+"""dyfn-export: a model's pure step as a file for another library."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from dyfn_core.models.export.step_file import StepInfo
 
 COMPLETE, UNUSABLE = 0, 2
-FORMATS = ("onnx",)
+FORMATS = ("onnx", "openvino", "tensorrt")
 SIZE = (480, 640)
 
 
@@ -33,7 +33,12 @@ def parser() -> argparse.ArgumentParser:
         "--out", type=Path, required=True, metavar="FILE", help="the file, replaced if it exists"
     )
     made.add_argument(
-        "--format", choices=FORMATS, default="onnx", help="of the file (default: %(default)s)"
+        "--format",
+        choices=FORMATS,
+        default="onnx",
+        help="of the file; openvino: FILE is NAME.xml, the weights are beside it in NAME.bin; "
+        "tensorrt: an engine for the GPU of this machine, what it is says FILE.json (default: "
+        "%(default)s)",
     )
     made.add_argument(
         "--size",
@@ -45,9 +50,9 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--int8",
         action="store_true",
-        help="layers compute in 8 bits where that loses little: less than 0.5 points of delta1 "
-        "and 1%% of median depth on the last third of the recording's frames; else nothing is "
-        "written",
+        help="format onnx: layers compute in 8 bits where that loses little: less than 0.5 points "
+        "of delta1 and 1%% of median depth on the last third of the recording's frames; else "
+        "nothing is written",
     )
     made.add_argument(
         "--calibrate",
@@ -65,6 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = made.parse_args(arguments)
     if options.int8 != (options.calibrate is not None):
         made.error("--int8 and --calibrate RECORDING go together")
+    if options.int8 and options.format != "onnx":
+        made.error(f"--int8 is for --format onnx, not {options.format}")
     try:
         info = _int8(options) if options.int8 else _float(options)
     except (FileNotFoundError, OutputError, ValueError) as error:
@@ -81,10 +88,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _float(options: argparse.Namespace) -> StepInfo:
     from dyfn_core.models.checkpoints import load_model
+
+    write = _writer(options.format)
+    model, size = load_model(options.model), options.size or SIZE
+    return write(model, options.out, size, options.num_tokens, options.stabilize)
+
+
+def _writer(kind: str) -> Callable[..., StepInfo]:
+    if kind == "openvino":
+        from dyfn_core.models.export.openvino_file import write_openvino_step
+
+        return write_openvino_step
+    if kind == "tensorrt":
+        from dyfn_core.models.export.tensorrt_file import write_tensorrt_step
+
+        return write_tensorrt_step
     from dyfn_core.models.export.step_file import write_step
 
-    model, size = load_model(options.model), options.size or SIZE
-    return write_step(model, options.out, size, options.num_tokens, options.stabilize)
+    return write_step
 
 
 def _int8(options: argparse.Namespace) -> StepInfo:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from dyfn_core.files import finished_file
 from dyfn_core.models.export.parts import LATENT
-from dyfn_core.models.export.step_file import KEY, info_of
+from dyfn_core.models.export.step_file import KEY, info_of, text_of
 
 INT8 = "int8"
 FIRST = 7  # layers of the encoder that stay float32: their maps span the widest ranges
@@ -78,7 +77,7 @@ def quantize(
         made = onnx.load(str(found))
     source = {entry.key: entry.value for entry in onnx.load(str(step)).metadata_props}
     info = replace(info_of(source, str(step)), precision=INT8)
-    onnx.helper.set_model_props(made, {KEY: json.dumps(asdict(info), sort_keys=True)})
+    onnx.helper.set_model_props(made, {KEY: text_of(info)})
     with finished_file(out) as partial:
         onnx.save(made, str(partial))
     layers = [node for node in graph.graph.node if node.op_type in LAYERS]

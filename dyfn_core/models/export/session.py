@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import onnxruntime
 import torch
@@ -15,6 +15,9 @@ from dyfn_core.models.export.onnx_graph import exported
 from dyfn_core.models.export.parts import Part, Tensors
 from dyfn_core.models.export.step_file import StepInfo, info_of
 from dyfn_core.models.formats import CheckpointError
+
+if TYPE_CHECKING:
+    from dyfn_core.models.export.openvino_graph import OpenVinoGraph
 
 CPU = ("CPUExecutionProvider",)
 CUDA = ("CUDAExecutionProvider", *CPU)
@@ -88,11 +91,11 @@ def _with_options(provider: str) -> str | tuple[str, dict[str, Any]]:
     return provider, {"trt_engine_cache_enable": True, "trt_engine_cache_path": str(folder)}
 
 
-def load_step(path: str | Path, threads: int = 0) -> tuple[StepInfo, OnnxSession]:
+def load_step(path: str | Path, threads: int = 0) -> tuple[StepInfo, OnnxSession | OpenVinoGraph]:
     """A file of dyfn-export, ready to run.
 
     Args:
-        path: The file.
+        path: The file; one that ends with .xml runs in OpenVINO, others in onnxruntime.
         threads: See OnnxSession.
 
     Returns:
@@ -104,5 +107,11 @@ def load_step(path: str | Path, threads: int = 0) -> tuple[StepInfo, OnnxSession
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"no such file: {path}")
-    session = OnnxSession(path, threads)
+    session: OnnxSession | OpenVinoGraph
+    if Path(path).suffix == ".xml":
+        from dyfn_core.models.export.openvino_graph import OpenVinoGraph
+
+        session = OpenVinoGraph(Path(path), threads)
+    else:
+        session = OnnxSession(path, threads)
     return info_of(session.metadata, str(path)), session

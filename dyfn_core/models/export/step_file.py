@@ -1,4 +1,4 @@
-"""The pure step of a model as one ONNX file that says what it is."""
+"""The pure step of a model as an ONNX graph that says what it is, and as a file."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def write_step(
     """Write the pure step of a model to an ONNX file, whole or not at all.
 
     Args:
-        model: On the CPU, float32.
+        model: See step_graph.
         path: The file, which is replaced if it exists.
-        image_size: (H, W) of the camera's images.
-        num_tokens: Resolution inside the model; None is the model's own.
-        stabilize: False for the base model; one without DyFN has no other step.
+        image_size: See step_graph.
+        num_tokens: See step_graph.
+        stabilize: See step_graph.
 
     Returns:
         What the file says of itself.
@@ -89,6 +89,32 @@ def write_step(
     Raises:
         CheckpointError: The model has something that ONNX cannot say.
         OutputError: The file cannot be written.
+    """
+    step, info = step_graph(model, image_size, num_tokens, stabilize)
+    with finished_file(Path(path)) as partial:
+        onnx.save(step, str(partial))
+    return info
+
+
+def step_graph(
+    model: GeometryModel,
+    image_size: Size = (480, 640),
+    num_tokens: int | None = None,
+    stabilize: bool = True,
+) -> tuple[onnx.ModelProto, StepInfo]:
+    """The pure step of a model as an ONNX graph.
+
+    Args:
+        model: On the CPU, float32.
+        image_size: (H, W) of the camera's images.
+        num_tokens: Resolution inside the model; None is the model's own.
+        stabilize: False for the base model; one without DyFN has no other step.
+
+    Returns:
+        The graph with its metadata, and what they say.
+
+    Raises:
+        CheckpointError: The model has something that ONNX cannot say.
     """
     with torch.inference_mode():
         prepared = model.prepare(torch.zeros(1, 3, *image_size), num_tokens)
@@ -104,10 +130,8 @@ def write_step(
         kind = full_config(model)["type"]
         raise CheckpointError(f"a model of type {kind!r} cannot be exported: {error}") from error
     info = _info(model, prepared, changed, state, num_tokens)
-    onnx.helper.set_model_props(step, {KEY: json.dumps(asdict(info), sort_keys=True)})
-    with finished_file(Path(path)) as partial:
-        onnx.save(step, str(partial))
-    return info
+    onnx.helper.set_model_props(step, {KEY: text_of(info)})
+    return step, info
 
 
 def _info(
@@ -134,6 +158,11 @@ def _info(
         first_state={name: FIRST_STATE[name] for name in shapes},
         metres_of_focal=model.metres_of_focal(latent.network_size),
     )
+
+
+def text_of(info: StepInfo) -> str:
+    """The JSON that info_of reads."""
+    return json.dumps(asdict(info), sort_keys=True)
 
 
 def info_of(metadata: Mapping[str, str], source: str) -> StepInfo:

@@ -5,24 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import onnx
 import pytest
 import torch
-from torch import Tensor
 
 from dyfn_core import __version__
 from dyfn_core.cli import export as dyfn_export
 from dyfn_core.models.base import GeometryModel
 from dyfn_core.models.checkpoints import CheckpointError, load_model, model_fingerprint
-from dyfn_core.models.export.parts import NEXT, affine_from, state_from, state_tensors
+from dyfn_core.models.export.parts import NEXT, state_from, state_tensors
 from dyfn_core.models.export.session import load_step
 from dyfn_core.models.export.step_file import KEY, info_of, write_step
 from dyfn_core.prediction import StreamState
-
-SIZE, TOKENS = (90, 120), 24
-FRAMES = 50
-CLOSE = 1e-4  # relative, of depth
+from tests.support.steps import CLOSE, SIZE, TOKENS, largest_difference
 
 
 @pytest.fixture(scope="module")
@@ -37,43 +32,10 @@ def step(mini: GeometryModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def walk(count: int) -> list[Tensor]:
-    """Pictures that drift over a texture and change their brightness, 1 x 3 x H x W."""
-    rng = np.random.default_rng(0)
-    coarse = torch.from_numpy(rng.uniform(0, 1, (1, 3, 30, 40))).float()
-    world = torch.nn.functional.interpolate(coarse, scale_factor=6, mode="bicubic").clamp(0, 1)
-    height, width = SIZE
-    return [
-        world[..., i : i + height, i : i + width] * (0.7 + 0.3 * np.cos(i / 5))
-        for i in range(count)
-    ]
-
-
-def largest_difference(model: GeometryModel, path: Path, stabilize: bool) -> float:
-    """Of depth, relative, over a stream whose state each side carries by itself."""
-    info, session = load_step(path)
-    after: StreamState | None = None
-    carried = {
-        name: torch.zeros(shape) if info.first_state[name] == "zeros" else torch.full(shape, np.nan)
-        for name, shape in info.state.items()
-    }
-    worst = 0.0
-    with torch.inference_mode():
-        for image in walk(FRAMES):
-            expected, after = model.predict_affine(image, after, TOKENS, stabilize)
-            pixels = model.prepare(image, TOKENS).pixels
-            found = session.run({"image": pixels, **carried})
-            if info.stabilized:
-                carried = state_tensors(state_from(found, NEXT))
-            values = affine_from(found).values
-            worst = max(worst, float((values / expected.values - 1).abs().max()))
-    return worst
-
-
 def test_the_step_with_dyfn_is_torchs_over_a_stream(mini: GeometryModel, step: Path) -> None:
     assert largest_difference(mini, step, stabilize=True) < CLOSE
     # The comparison can fail: DyFN is in the file.
-    assert largest_difference(mini, step, stabilize=False) > CLOSE
+    assert largest_difference(mini, step, stabilize=False, frames=5) > CLOSE
 
 
 def test_the_base_has_a_step_without_state(mini: GeometryModel, tmp_path: Path) -> None:
