@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from dyfn_core.cli.chosen_data import open_sequence, places
 from dyfn_core.cli.fuse_aligned import run_fusion
+from dyfn_core.evaluation.choices import TRUE
 from dyfn_core.evaluation.reconstruction.cloud_error import write_ply
 from dyfn_core.evaluation.reconstruction.matching import build_matcher
 from dyfn_core.evaluation.reconstruction.poses import ReconstructionOptions
@@ -70,6 +71,7 @@ def run(options: argparse.Namespace) -> int:
         settings,
         true_depth=options.true_depth,
         num_tokens=options.num_tokens,
+        true_poses=options.poses == TRUE,
     )
     results = {name: judge(found, name, options.tolerance) for name in found.runs}
     options.out.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ import argparse
 from dyfn_core.argument_types import at_least_one, finite_above_zero, not_negative
 from dyfn_core.cli.arguments import Commands
 from dyfn_core.cli.data_arguments import add_data_arguments
-from dyfn_core.evaluation.choices import OFFSETS
+from dyfn_core.evaluation.choices import CHAINED, OFFSETS, PARTNER_POSES
 
 
 def add_parser(commands: Commands) -> None:
@@ -32,6 +32,13 @@ def add_parser(commands: Commands) -> None:
         default=list(OFFSETS),
         metavar="N",
         help=f"match with the frames N earlier (default: {' '.join(map(str, OFFSETS))})",
+    )
+    add(
+        "--poses",
+        choices=PARTNER_POSES,
+        default=CHAINED,
+        help="register frames to the found poses of earlier ones, or to their true poses as the "
+        "paper does (default: chained)",
     )
     add(
         "--threshold",

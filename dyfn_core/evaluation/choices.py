@@ -1,6 +1,7 @@
 """What a command line of the evaluation may choose, apart from the modules that import torch."""
 
 AUTO, ORIGINAL, DEPTHCRAFTER = LAYOUTS = ("auto", "original", "depthcrafter")
+CHAINED, TRUE = PARTNER_POSES = ("chained", "true")
 POINTS, POSES = METRES = ("points", "poses")
 # Frames of dyfn-eval long.
 LENGTHS = (100, 200, 300, 400, 500)

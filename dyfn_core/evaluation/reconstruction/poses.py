@@ -90,13 +90,19 @@ class Reconstruction:
         self._kept = deque(maxlen=max(self.options.offsets))
 
     def push(
-        self, image: np.ndarray, points: np.ndarray, valid: np.ndarray, window: MatchWindow
+        self,
+        image: np.ndarray,
+        points: np.ndarray,
+        valid: np.ndarray,
+        window: MatchWindow,
+        known: Similarity | None = None,
     ) -> FramePose:
         """The next frame.
 
         image: H x W x 3 uint8 RGB, already pushed to window. points: H x W x 3, optical frame, up
-        to scale. valid: H x W bool. Raises ValueError when the window does not reach far enough
-        or the shapes differ.
+        to scale. valid: H x W bool. known: the frame's true pose, which the first frame takes and
+        later frames register to in place of the one found; then points are in its unit. Raises
+        ValueError when the window does not reach far enough or the shapes differ.
         """
         if image.shape[:2] != points.shape[:2] or valid.shape != points.shape[:2]:
             raise ValueError(
@@ -109,9 +115,10 @@ class Reconstruction:
         usable = valid & np.isfinite(points).all(-1) & (points[..., 2] > 0)
         usable &= ~flying_pixels(points[..., 2], usable, EDGE_SHARE)
         clean = np.where(usable[..., None], points, np.nan).astype(np.float32)
-        found = self._first(clean) if self.cloud is None else self._pose(clean, window)
+        first = self.cloud is None
+        found = self._first(clean, known) if first else self._pose(clean, window)
         self.frames.append(found)
-        self._kept.append(_Kept(clean, found.pose))
+        self._kept.append(_Kept(clean, found.pose if known is None else known))
         if found.pose is not None and self.cloud is not None:
             step = self.options.stride
             chosen = np.isfinite(clean[::step, ::step, 2])
@@ -129,13 +136,13 @@ class Reconstruction:
         """Why frames have no pose -> how many."""
         return dict(Counter(f.problem.split(":")[0] for f in self.frames if f.problem is not None))
 
-    def _first(self, points: np.ndarray) -> FramePose:
+    def _first(self, points: np.ndarray, known: Similarity | None) -> FramePose:
         depth = points[..., 2][np.isfinite(points[..., 2])]
         if not depth.size:
             return FramePose(None, problem="no valid point")
         size = self.options.voxel * float(np.median(depth))
         self.cloud = VoxelGrid(size, self.options.max_voxels)
-        return FramePose(Similarity.identity())
+        return FramePose(Similarity.identity() if known is None else known)
 
     def _pose(self, points: np.ndarray, window: MatchWindow) -> FramePose:
         chosen = partners(self.options.offsets, [kept.pose is not None for kept in self._kept])

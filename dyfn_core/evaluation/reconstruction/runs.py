@@ -105,10 +105,13 @@ def reconstruct_sequence(
     *,
     true_depth: bool = True,
     num_tokens: int | None = None,
+    true_poses: bool = False,
 ) -> SequenceRuns:
     """Reconstruct the frames at `places` of the sequence; the matches are found once for all runs.
 
-    model: None for true depth alone. true_depth: also with the sequence's own depth. A frame that
+    model: None for true depth alone. true_depth: also with the sequence's own depth. true_poses:
+    every frame is registered to the true poses of its partners, with predictions brought to metres
+    by one scale for the sequence, for which it is run through the model once more. A frame that
     cannot be read is left out and counted. Raises ValueError when there is nothing to run, or no
     frame could be read.
     """
@@ -118,15 +121,20 @@ def reconstruct_sequence(
     if not names:
         raise ValueError("nothing to reconstruct from: give a model, or use the true depth")
     found = SequenceRuns({name: Reconstruction(chosen) for name in names})
-    window = MatchWindow(matcher, max(chosen.offsets))
+    window, places = MatchWindow(matcher, max(chosen.offsets)), list(places)
+    metres = dict.fromkeys(streams, 1.0)
+    if true_poses and model is not None:
+        metres = sequence_scales(sequence, places, model_streams(model, num_tokens))
     for frame in _readable(sequence, places, found.losses):
         window.push(frame.image)
         true_points, true_valid = _true_points(frame)
+        known = _known_pose(frame, sequence.name) if true_poses else None
         for name, run in found.runs.items():
             if name == TRUE_DEPTH:
-                run.push(frame.image, true_points, true_valid, window)
+                run.push(frame.image, true_points, true_valid, window, known)
             else:
-                run.push(frame.image, *_predicted(streams[name], frame), window)
+                points, valid = _predicted(streams[name], frame)
+                run.push(frame.image, points * metres[name], valid, window, known)
         found.known.append(frame.pose)
         _fuse_truth(found, frame, true_points, true_valid, chosen)
     if not found.known:
@@ -141,6 +149,33 @@ def model_streams(model: GeometryModel, num_tokens: int | None) -> dict[str, Dep
         name: DepthStream(model, stabilize=stabilize, num_tokens=num_tokens)
         for name, stabilize in ways.items()
     }
+
+
+def sequence_scales(
+    sequence: FrameSequence, places: Iterable[int], streams: Mapping[str, DepthStream]
+) -> dict[str, float]:
+    """Metres in one predicted unit: the median over frames of the median of true over predicted.
+
+    Raises ValueError when no frame has true depth.
+    """
+    ratios: dict[str, list[float]] = {name: [] for name in streams}
+    for frame in _readable(sequence, places, Counter()):
+        truth, known = _true_points(frame)
+        for name, stream in streams.items():
+            points, valid = _predicted(stream, frame)
+            both = known & valid & (points[..., 2] > 0)
+            if both.any():
+                ratios[name].append(float(np.median(truth[both][:, 2] / points[both][:, 2])))
+    empty = [name for name, found in ratios.items() if not found]
+    if empty:
+        raise ValueError(f"{sequence.name}: no true depth to scale {empty[0]!r} by")
+    return {name: float(np.median(found)) for name, found in ratios.items()}
+
+
+def _known_pose(frame: RgbdFrame, name: str) -> Similarity:
+    if frame.pose is None or not np.isfinite(frame.pose).all():
+        raise ValueError(f"{name}: a frame has no true pose to register others to")
+    return Similarity.from_matrix(frame.pose)
 
 
 def _readable(

@@ -225,3 +225,11 @@ def test_fuse_aligned_leaves_out_frames_without_a_pose(room: Path, tmp_path: Pat
     assert main(["reconstruct", str(other), "--out", str(tmp_path / "o"), "--fuse-aligned"]) == 3
     found = json.loads((tmp_path / "o/fusion.json").read_text())
     assert found["frames"] == FRAMES - 1 and list(found["losses"].values()) == [1]
+
+
+def test_poses_of_partners_may_be_the_true_ones(room: Path, tmp_path: Path) -> None:
+    words = ["reconstruct", str(room), "--out", str(tmp_path), "--offsets", "1", "3"]
+    assert main([*words, "--matcher", "dis", "--max-frames", "4", "--poses", "true"]) == 0
+    found = json.loads((tmp_path / "reconstruction.json").read_text())
+    assert found["options"]["poses"] == "true"
+    assert found["runs"]["true depth"]["trajectory"]["scale"] == pytest.approx(1, abs=0.1)

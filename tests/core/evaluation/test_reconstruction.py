@@ -97,6 +97,46 @@ def test_one_unknown_scale_costs_nothing_and_drifting_scale_does(matcher: ExactM
     assert scaled.cloud is not None and scaled.cloud.chamfer < 0.02
 
 
+def test_true_poses_of_partners_stop_errors_from_adding_up(matcher: ExactMatcher) -> None:
+    growing = Scaled(np.exp(0.02 * np.arange(FRAMES)))
+    room = RoomSequence(FRAMES)
+    chained, true, exact = (
+        reconstruct_sequence(one, range(FRAMES), matcher, None, OPTIONS, true_poses=way)
+        for one, way in ((growing, False), (growing, True), (room, True))
+    )
+    for pose, wanted in zip(exact.runs[TRUE_DEPTH].poses, exact.known, strict=True):
+        assert pose is not None and wanted is not None
+        np.testing.assert_allclose(pose.matrix, wanted, atol=0.02)
+    last = true.runs[TRUE_DEPTH].poses[-1], chained.runs[TRUE_DEPTH].poses[-1]
+    assert last[0] is not None and last[1] is not None
+    begin, wanted = Similarity.from_matrix(camera_pose(0)), camera_pose(FRAMES - 1)[:3, 3]
+    near, far = (
+        np.linalg.norm(pose.translation - wanted) for pose in (last[0], begin.after(last[1]))
+    )
+    assert near < 0.5 * far, (near, far)
+
+
+def test_predictions_are_in_metres_beside_true_poses(matcher: ExactMatcher) -> None:
+    model = PinholeModel(stabilized=True).eval()
+    found = reconstruct_sequence(
+        RoomSequence(4), range(4), matcher, model, OPTIONS, true_poses=True
+    )
+    cloud = found.runs[BASE].cloud
+    assert cloud is not None and found.true_cloud is not None
+    reach, wanted = (np.ptp(c.cloud()[0], axis=0).max() for c in (cloud, found.true_cloud))
+    assert 0.4 < reach / wanted < 2.5
+
+
+def test_a_frame_without_a_true_pose_is_refused(matcher: ExactMatcher) -> None:
+    class Unposed(RoomSequence):
+        def read(self, index: int):  # type: ignore[no-untyped-def]
+            frame = room_frame(index)
+            return type(frame)(frame.image, frame.depth, frame.intrinsics, None)
+
+    with pytest.raises(ValueError, match="room: a frame has no true pose"):
+        reconstruct_sequence(Unposed(2), range(2), matcher, None, OPTIONS, true_poses=True)
+
+
 def test_a_path_that_fixes_no_scale_is_told(matcher: ExactMatcher) -> None:
     found = runs(matcher, np.ones(FRAMES))
     rng = np.random.default_rng(0)
