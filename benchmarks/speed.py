@@ -335,6 +335,7 @@ def main() -> None:
         found[title] = TABLES[title](bench)
         print("\n".join(told(title, found[title])), flush=True)
     facts = {**machine(), "rounds": options.rounds, "seconds": round(time.monotonic() - start)}
+    facts["load"] = f"{os.getloadavg()[2]:.1f} on {os.cpu_count()} cores"  # of 15 minutes
     plain = {t: {n: row.values() for n, row in table.items()} for t, table in found.items()}
     if options.out:
         text = json.dumps({"machine": facts, "tables": plain}, indent=2)
