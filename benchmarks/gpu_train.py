@@ -30,7 +30,7 @@ from dyfn_worlds.maps.quake import GameFiles
 ROOT = Path(__file__).resolve().parents[1]
 BASE_CONFIG = ROOT / "config/train_base_mini_real.yaml"
 DYFN_CONFIG = ROOT / "config/train_dyfn_mini_more.yaml"
-START = ROOT / "dyfn_core/weights/dyfn-mini-8.safetensors"
+START = ROOT / "dyfn_core/weights/dyfn-mini-9.safetensors"
 BUDGET = 64e6  # bytes that may be carried: the code, two models, the art and the recordings
 NEEDED = ("dyfn_core", "dyfn_worlds", "config", "benchmarks")
 # of the whole time; the rest is for starting processes, averaging, moving and packing

@@ -46,17 +46,19 @@ MODEL_TYPES: dict[str, type[GeometryModel]] = {
     "moge2": MoGe2Model,
 }
 BUNDLED = {
-    "dyfn-mini": "dyfn-mini-8.safetensors",
-    "dyfn-mini-5": "dyfn-mini.safetensors",  # the default before
+    "dyfn-mini": "dyfn-mini-9.safetensors",
+    "dyfn-mini-5": "dyfn-mini.safetensors",
     "dyfn-mini-6": "dyfn-mini-6.safetensors",
     "dyfn-mini-7": "dyfn-mini-7.safetensors",
-    "dyfn-mini-8": "dyfn-mini-8.safetensors",  # the default by its version
+    "dyfn-mini-8": "dyfn-mini-8.safetensors",  # the default before
+    "dyfn-mini-9": "dyfn-mini-9.safetensors",  # the default by its version
 }
 # SHA-256 of the bundled files, which are checked when they are loaded.
 BUNDLED_SHA256 = {
     "dyfn-mini-6.safetensors": "c42f9390e858be7998bf96bae6f76ed1eedde96a0fd2326055346a0c7fbf4294",
     "dyfn-mini-7.safetensors": "43d8c84c699ce9bd794b78c60f2fb079f399e87457fa939b8825f0d8caafa9c1",
     "dyfn-mini-8.safetensors": "4ac799e188ca029b6c319573c200cccc733dbba6e89ceb299d64ffdbd01b7abe",
+    "dyfn-mini-9.safetensors": "c0d302cfb248cb4a373b18de9fc28a7b27e8cf4e4eabdb52b37409d2ce0ae3d9",
     "dyfn-mini.safetensors": "69db69fa6c46167625f787b94deccf87b492c8b58ed993385304d190a4dec08a",
 }
 OFFICIAL_STABILIZER = "head.stabilizer."

@@ -162,12 +162,12 @@ def test_checkpoint_brings_the_same_model_back(model: MiniModel, tmp_path: Path)
 
 
 def test_bundled_versions_load_by_name() -> None:
-    default, eight = (load_model(name) for name in ("dyfn-mini", "dyfn-mini-8"))
-    pairs = zip(default.state_dict().values(), eight.state_dict().values(), strict=True)
+    default, nine = (load_model(name) for name in ("dyfn-mini", "dyfn-mini-9"))
+    pairs = zip(default.state_dict().values(), nine.state_dict().values(), strict=True)
     assert all(torch.equal(ours, theirs) for ours, theirs in pairs)
     image = uniform(0, 1, 3, 96, 128)
     depths = [default.infer(image).depth]
-    for name in ("dyfn-mini-5", "dyfn-mini-6", "dyfn-mini-7"):
+    for name in ("dyfn-mini-5", "dyfn-mini-6", "dyfn-mini-7", "dyfn-mini-8"):
         model = load_model(name)
         assert model.stabilizer is not None
         assert {value.dtype for value in model.parameters()} == {torch.float32}
