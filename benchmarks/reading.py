@@ -1,9 +1,10 @@
 """Messages a second and memory of reading a recording, against the plain libraries.
 
-    python benchmarks/reading.py [--frames 400] [--size 320x240] [--rounds 3]
+    python benchmarks/reading.py [--frames 400] [--size 320x240] [--rounds 3] [--before FOLDER]
 
 A recording of raw images, depth and CameraInfo is made in each storage. Every reader reads all of
-it in a process of its own, in turns: `dyfn_ros.recordings`, and `mcap` or `rosbags` themselves.
+it in a process of its own, in turns: `dyfn_ros.recordings`, and `mcap` or `rosbags` themselves, or
+`dyfn_ros.recordings` of another checkout.
 The rows are CPU time (the best of the rounds) and the peak resident memory above that before
 reading; `ratio` is the first over the second.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -26,13 +28,13 @@ from dyfn_ros.recordings.typestore import CAMERA_INFO, IMAGE, TYPES, camera_info
 from tests.support.made_recordings import ROS1, ros1_bytes
 
 RATE = 30
-OURS, PLAIN = "dyfn_ros", "plain"
+OURS, PLAIN, BEFORE = "dyfn_ros", "plain", "before"
 # Reads everything; says how many messages, bytes, CPU seconds, and kilobytes above the start.
 CHILD = """
 import json, resource, sys, time
 from pathlib import Path
 path, reader = Path(sys.argv[1]), sys.argv[2]
-if reader == "dyfn_ros":
+if reader != "plain":
     from dyfn_ros.recordings.storage.open import open_storage
 elif path.suffix == ".mcap":
     from mcap.reader import make_reader
@@ -42,7 +44,7 @@ else:
     from rosbags.rosbag2 import Reader
 
 def sizes():
-    if reader == "dyfn_ros":
+    if reader != "plain":
         storage = open_storage(path)
         for recorded in storage.messages(storage.topics):
             yield len(recorded.data)
@@ -105,10 +107,13 @@ def write_bag1(path: Path, frames: int, size: tuple[int, int]) -> Path:
     return path
 
 
-def measure(path: Path, reader: str) -> tuple[int, int, float, float]:
-    """Messages, bytes, CPU seconds, MB above the start."""
+def measure(path: Path, reader: str, checkout: Path) -> tuple[int, int, float, float]:
+    """Messages, bytes, CPU seconds, MB above the start, by the code of a checkout."""
     command = [sys.executable, "-c", CHILD, str(path), reader]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    out = subprocess.run(
+        command, capture_output=True, text=True, check=True, env=environment, cwd=path.parent
+    ).stdout
     count, size, seconds, kilobytes = json.loads(out)
     return count, size, seconds, kilobytes / 1024
 
@@ -119,7 +124,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--size", default="320x240", help="of images, WIDTHxHEIGHT")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--before", type=Path, help="another checkout, in the plain readers' place")
     options = parser.parse_args()
+    here = Path(__file__).resolve().parents[1]
+    readers = {OURS: here, PLAIN: here}
+    if options.before:
+        readers = {OURS: here, BEFORE: options.before.resolve()}
     width, height = map(int, options.size.split("x"))
     size = height, width
     with tempfile.TemporaryDirectory() as name:
@@ -133,9 +143,12 @@ def main() -> None:
         print("storage       reader    messages/s    MB/s   peak MB")
         for storage, make in makers.items():
             path = make()
-            rounds = [[measure(path, r) for r in (OURS, PLAIN)] for _ in range(options.rounds)]
+            rounds = [
+                [measure(path, reader, place) for reader, place in readers.items()]
+                for _ in range(options.rounds)
+            ]
             best = [min((one[k] for one in rounds), key=lambda found: found[2]) for k in (0, 1)]
-            for reader, (count, total, seconds, peak) in zip((OURS, PLAIN), best, strict=True):
+            for reader, (count, total, seconds, peak) in zip(readers, best, strict=True):
                 speed = f"{count / seconds:12.0f}{total / seconds / 1e6:9.0f}{peak:9.1f}"
                 print(f"{storage:14}{reader:8}{speed}")
             assert best[0][0] == best[1][0], "both read the same messages"

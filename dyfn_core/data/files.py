@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from dyfn_core.data.frames import DataError, DataReport, FrameError, RgbdFrame
+from dyfn_core.data.heads import told_by_head
 
 LISTED = 8  # entries of a folder that an error names
 EXR_CHANNELS = ("Y", "Z", "V", "R")  # where a one-channel picture may be
-LFS_POINTER = b"version https://git-lfs"  # how its text begins
 SAME_ASPECT = 0.02  # relative difference at which colour and depth are the same view
 
 
@@ -192,7 +192,8 @@ def numbers(path: Path, expected: str) -> np.ndarray:
     try:
         return np.loadtxt(path, dtype=np.float64, ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise FrameError(f"{expected}: {error}") from error
+        told = told_by_head(path)
+        raise FrameError(f"{expected}: {f'it is {told}' if told else error}") from error
 
 
 def _decoded(path: Path, flags: int) -> np.ndarray:
@@ -202,7 +203,7 @@ def _decoded(path: Path, flags: int) -> np.ndarray:
     except (OSError, cv2.error) as error:
         raise FrameError(f"{path}: cannot be read: {error}") from error
     if pixels is None:
-        if data[: len(LFS_POINTER)].tobytes() == LFS_POINTER:
-            raise FrameError(f"{path} is a Git LFS pointer: `git lfs pull` fetches the image")
+        if told := told_by_head(path, "image"):
+            raise FrameError(f"{path} is {told}")
         raise FrameError(f"{path}: no such image, or a damaged one")
     return pixels

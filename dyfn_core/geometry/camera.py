@@ -13,6 +13,8 @@ SAMPLES = 64
 # Distances of the nearest sample after the shift that are tried first, in units of the depth
 # range: falling, so that q rises.
 _GRID = np.geomspace(1e4, 1e-4, 49)
+OFF_CENTRE = 0.15  # of the width or height: a principal point farther from the middle is doubted
+SAME_SHARE = 0.05  # of these two: what counts as the same place
 FOCAL_RANGE = (0.1, 10.0)  # focal lengths in units of the image's width that are believed
 
 
@@ -80,6 +82,29 @@ def doubted_intrinsics(pixels: tuple[float, float, float, float], size: tuple[in
         f"{width} x {height}: expected the principal point inside and focal lengths of {low:g} "
         f"to {high:g}"
     )
+
+
+def off_centre(pixels: tuple[float, float, float, float], size: tuple[int, int]) -> str:
+    """Why intrinsics are unlikely to be of images of a size, as a sentence; "" when they may be.
+
+    pixels, size: as of doubted_intrinsics. Cameras have their principal point near the middle;
+    it is elsewhere in intrinsics of another resolution or of the image turned, and in a picture
+    that was cropped.
+    """
+    (height, width), (fx, fy, cx, cy) = size, pixels
+    across, down = (cx + 0.5) / width, (cy + 0.5) / height
+    if max(abs(across - 0.5), abs(down - 0.5)) <= OFF_CENTRE:
+        return ""
+    told = (
+        f"fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} have the principal point {across:.0%} across and "
+        f"{down:.0%} down images of {width} x {height}, expected near the middle"
+    )
+    if abs(across - down) <= SAME_SHARE:
+        columns, rows = round(2 * cx + 1), round(2 * cy + 1)
+        return f"{told}: intrinsics of {columns} x {rows}?"
+    if abs((cx + 0.5) / height - 0.5) <= SAME_SHARE >= abs((cy + 0.5) / width - 0.5):
+        return f"{told}: intrinsics of the image turned, {height} x {width}?"
+    return f"{told}: a cropped picture, or intrinsics of another?"
 
 
 def focal_from_fov(fov_x: float | Tensor, aspect: float, batch: int) -> Tensor:

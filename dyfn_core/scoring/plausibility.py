@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dyfn_core.geometry.camera import doubted_intrinsics
+from dyfn_core.geometry.camera import doubted_intrinsics, off_centre
 from dyfn_core.scoring.edge_agreement import EdgeAgreement
 
 NEAREST, FARTHEST = 0.05, 200.0  # metres: a median of true depth outside is doubted
@@ -67,7 +67,7 @@ class Plausibility:
         self._frozen = 0  # pairs with another picture and the truth before it
         self._last_stamp: float = -math.inf
         self._not_rising = 0
-        self._camera = ""  # the first intrinsics that cannot be
+        self._camera = ""  # what is wrong with the first intrinsics that are doubted
 
     def push(
         self,
@@ -91,7 +91,8 @@ class Plausibility:
         if camera_matrix is not None and not self._camera:
             (fx, _, cx), (_, fy, cy) = camera_matrix[:2].tolist()
             size = (image.shape[0], image.shape[1])
-            self._camera = doubted_intrinsics((fx, fy, cx, cy), size)
+            pixels = (fx, fy, cx, cy)
+            self._camera = doubted_intrinsics(pixels, size) or off_centre(pixels, size)
         if truth is None:
             return
         depth = truth[np.isfinite(truth) & (truth > 0)]

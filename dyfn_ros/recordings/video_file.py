@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from dyfn_core.data.heads import told_by_head
 from dyfn_ros.recordings.camera_yaml import CameraYaml
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord
@@ -100,7 +101,9 @@ def video_frames(
     finally:
         video.release()
     if decoded == 0:
-        raise RecordingError(f"{path}: expected a video file, no frame can be decoded")
+        told = told_by_head(path, "video")
+        why = f"it is {told}" if told else "no frame can be decoded"
+        raise RecordingError(f"{path}: expected a video file, {why}")
     if late and len(late) == decoded - 1:
         raise RecordingError(
             f"{path}: holds no times of its {decoded} frames (a raw H.264 or H.265 stream has "

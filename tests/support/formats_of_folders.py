@@ -172,6 +172,35 @@ def raw_stream(codec: str, suffix: str) -> Maker:
     return make
 
 
+def replaced(make: Maker, name: str, data: bytes) -> Maker:
+    """The same with something else in the place of a file."""
+
+    def both(folder: Path) -> Path:
+        make(folder)
+        (folder / name).write_bytes(data)
+        return folder
+
+    return both
+
+
+def no_video(data: bytes) -> Maker:
+    def make(folder: Path) -> Path:
+        (folder / "walk.mp4").write_bytes(data)
+        return folder / "walk.mp4"
+
+    return make
+
+
+def elsewhere(folder: Path) -> Path:
+    """Lists that were written where the pictures were before."""
+    tum()(folder)
+    for name in ("rgb", "depth"):
+        table = folder / f"{name}.txt"
+        table.write_text(table.read_text().replace(f" {name}/", f" /before/{name}/"))
+    return folder
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 12\n"
 SENSOR = (
     "m_colorWidth = 32\nm_colorHeight = 24\nm_depthShift = 1000\n"
     "m_calibrationColorIntrinsic = 40 0 15.5 0 0 40 11.5 0 0 0 1 0 0 0 0 1\n"
@@ -207,6 +236,12 @@ FOLDERS: dict[str, Maker] = {
     ),
     "hidden files, `Thumbs.db`": companions,
     "`K.txt` of another size": numbered(matrix="400 0 319.5\n0 400 239.5\n0 0 1\n"),
+    "`K.txt` of an image half as large": numbered(matrix="20 0 7.5\n0 20 5.5\n0 0 1\n"),
+    "`K.txt` of the image turned": numbered(matrix="40 0 11.5\n0 40 15.5\n0 0 1\n"),
+    "`rgb.txt` as a Git LFS pointer": replaced(tum(), "rgb.txt", LFS),
+    "`K.txt` as a Git LFS pointer": replaced(numbered(), "K.txt", LFS),
+    "pictures in `rgb/` of another kind": numbered("rgb/{0}.webp"),
+    "TUM's lists name files that are elsewhere": elsewhere,
     "`K.txt` transposed": numbered(matrix="40 0 0\n0 40 0\n15.5 11.5 1\n"),
     "depth as `.npy`, `.exr`, `.tiff`, `.jpg`": arrays,
     "depth as 8-bit PNG": numbered(pixels=eighths),
@@ -217,6 +252,8 @@ FOLDERS: dict[str, Maker] = {
     "EuRoC's `mav0/`": euroc,
     "video": video([0.0, 0.033, 0.066, 0.1]),
     "video of variable rate": video([0.0, 0.033, 0.3, 0.5]),
+    "video: a Git LFS pointer": no_video(LFS),
+    "video: a web page": no_video(b"<!DOCTYPE html><html></html>"),
     "raw H.264": raw_stream("h264", ".h264"),
     "raw H.265": raw_stream("hevc", ".265"),
 }

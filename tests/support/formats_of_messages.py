@@ -27,6 +27,7 @@ from tests.support.formats_of_bags import (
     bag,
     bag1,
     bare,
+    beginning,
     colours,
     image,
     infos,
@@ -145,6 +146,7 @@ def binned() -> list[Event]:
     described = infos(size=(48, 64))
     for event in described:
         event.message.binning_x = event.message.binning_y = 2
+        event.message.k = np.array([80, 0, 31.5, 0, 80, 23.5, 0, 0, 1.0])
     return [*colours(), *truths(), *described]
 
 
@@ -227,6 +229,7 @@ FILES: dict[str, Maker] = {
     "`.mcap.zst` of many frames (pzstd)": many_frames,
     "a link that leads nowhere": broken_link,
     "`.bag.gz`": gzipped,
+    "git-annex pointer": beginning(b"../.git/annex/objects/0p/SHA256E-s9--ab.mcap\n", "walk.mcap"),
     "CDR, most significant byte first": big_endian_cdr,
     "CDR that says to be XCDR 2": other_cdr,
 }

@@ -10,6 +10,7 @@ import numpy as np
 
 from dyfn_core.data.files import SAME_ASPECT
 from dyfn_core.data.frames import DataError, FrameError
+from dyfn_core.data.heads import told_by_head
 from dyfn_core.geometry.camera import doubted_intrinsics
 
 Camera = tuple[float, float, float, float]  # fx, fy, cx, cy in pixels, the first pixel's centre 0
@@ -159,7 +160,9 @@ def read_camera(path: Path) -> FolderCamera:
         words = (word for line in lines for word in re.split(r"[\s,;\[\]]+", line) if word)
         values = [float(word) for word in words]
     except (OSError, ValueError) as error:
-        raise DataError(f"{path}: expected {EXPECTED}: {error}") from error
+        told = told_by_head(path)
+        why = f"it is {told}" if told else error
+        raise DataError(f"{path}: expected {EXPECTED}: {why}") from error
     shapes = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
     if len(values) == 4:
         fx, fy, cx, cy = values

@@ -185,7 +185,9 @@ def open_folder(path: Path, report: DataReport, options: FolderOptions | None = 
     except FrameError as error:
         raise DataError(str(error)) from error
     if not opened.frames:
-        raise DataError(f"{path}: expected colour images (jpg or png) and found none")
+        found = [f"{len(what)} x {why} ({what[0]})" for why, what in report.problems.items()]
+        held = "; ".join(["none", *found])
+        raise DataError(f"{path}: expected colour images (jpg or png) and found {held}")
     return opened
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from dyfn_core.data.files import numbers, read_table, usable_poses
 from dyfn_core.data.frames import DataError, DataReport, FrameError
+from dyfn_core.data.heads import told_by_head
 from dyfn_core.data.rgbd.names import in_seconds
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
@@ -103,6 +104,8 @@ def _lines(path: Path) -> list[str]:
         lines = (line.strip() for line in path.read_text("utf-8-sig").splitlines())
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
+    if told := told_by_head(path):
+        raise DataError(f"{path} is {told}")
     return [line for line in lines if line and not line.startswith("#")]
 
 

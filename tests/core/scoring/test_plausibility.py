@@ -190,6 +190,29 @@ def test_intrinsics_of_other_images_are_named(pixels: tuple[float, ...]) -> None
     assert "of images of 96 x 72" in text and text.endswith("; CAMERA")
 
 
+@pytest.mark.parametrize(
+    ("pixels", "guess"),
+    [
+        ((40, 40, 23.5, 17.5), "of 48 x 36?"),
+        ((160, 160, 88, 66), "of 177 x 133?"),
+        ((80, 80, 35.5, 47.5), "of the image turned, 72 x 96?"),
+        ((80, 80, 47.5, 10.0), "a cropped picture, or intrinsics of another?"),
+    ],
+)
+def test_intrinsics_whose_principal_point_is_off_the_middle_are_doubted(
+    pixels: tuple[float, ...], guess: str
+) -> None:
+    fx, fy, cx, cy = pixels
+    text = one(told(matrix=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])))
+    assert text.startswith(f"fx={fx:g} fy={fy:g} cx={cx:g} cy={cy:g} have the principal point")
+    assert f"{guess}; CAMERA" in text
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(47.5, 35.5), (38, 42), (58, 29)])
+def test_a_principal_point_near_the_middle_is_believed(cx: float, cy: float) -> None:
+    assert told(matrix=np.array([[80, 0, cx], [0, 80, cy], [0, 0, 1.0]])) == []
+
+
 def test_unknown_intrinsics_are_no_wrong_ones() -> None:
     assert told(matrix=None) == []
 
