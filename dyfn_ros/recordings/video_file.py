@@ -32,7 +32,7 @@ def is_video_name(path: Path) -> bool:
 
 def expected_frames(path: Path) -> int:
     """How many frames a video announces, 0 when it does not say; an estimate in some containers."""
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path.absolute()))  # 12:30.mp4 is no address
     try:
         return max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     finally:
@@ -47,7 +47,7 @@ def video_tracks(path: Path) -> int:
     except ImportError:
         return 0
     try:
-        with av.open(str(path)) as video:
+        with av.open(str(path.absolute())) as video:
             return sum(not track.disposition & COVER for track in video.streams.video)
     except (av.FFmpegError, OSError, ValueError):
         return 0
@@ -78,7 +78,7 @@ def video_frames(
     """
     if camera is not None:
         matrix, lens = camera.matrix, camera.lens
-    video = cv2.VideoCapture(str(path))
+    video = cv2.VideoCapture(str(path.absolute()))  # 12:30.mp4 is no address
     try:
         announced, fps = (video.get(p) for p in (cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_FPS))
         decoded, last, longest, late = 0, -math.inf, 0.0, []

@@ -73,7 +73,9 @@ class Mp4File:
 
     def _begin(self, picture: np.ndarray) -> None:
         partial = self._stack.enter_context(finished_file(self._path))
-        opened = self._av.open(str(partial), "w", "mp4", options={"movflags": "faststart"})
+        opened = self._av.open(
+            str(partial.absolute()), "w", "mp4", options={"movflags": "faststart"}
+        )
         self._container = self._stack.enter_context(opened)
         stream = self._container.add_stream(CODEC, options={"crf": "20", "preset": "veryfast"})
         stream.height, stream.width = (side + side % 2 for side in picture.shape[:2])

@@ -6,6 +6,7 @@ Each maker takes a folder that is empty and gives the path to open.
 from __future__ import annotations
 
 import gzip
+import shutil
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,7 @@ from tests.support.formats_of_bags import (
     beginning,
     colours,
     image,
+    in_mcap,
     infos,
     millimetres,
     of,
@@ -59,6 +61,15 @@ def twins(folder: Path) -> Path:
     for plugin, suffix in ((StoragePlugin.MCAP, "mcap"), (StoragePlugin.SQLITE3, "db3")):
         path = next(bag(folder / suffix, whole(), plugin).glob(f"*.{suffix}"))
         path.rename(made / f"walk.{suffix}")
+    return made
+
+
+def copied(folder: Path) -> Path:
+    path = bare(folder)
+    made = folder / "walk"
+    made.mkdir()
+    shutil.copy(path, made / "walk (1).mcap")
+    path.rename(made / "walk.mcap")
     return made
 
 
@@ -226,6 +237,8 @@ def realsense(folder: Path) -> Path:
 FILES: dict[str, Maker] = {
     "split, listed in another order": reversed_list,
     "the same as `.mcap` and `.db3`, no `metadata.yaml`": twins,
+    "a file and its copy (`walk (1).mcap`), no `metadata.yaml`": copied,
+    "message encoding in capitals (`CDR`)": in_mcap("CDR", "{0}/msg/{1}"),
     "`.mcap.zst` of many frames (pzstd)": many_frames,
     "a link that leads nowhere": broken_link,
     "`.bag.gz`": gzipped,

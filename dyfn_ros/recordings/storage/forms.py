@@ -58,6 +58,7 @@ class Form:
 def message_form(encoding: str, schema: Schema | None) -> Form:
     """cdr and ros1 of any type, json and protobuf of Foxglove's images, video and calibration."""
     name = "" if schema is None else schema.name
+    encoding = encoding.lower()
     if encoding == "cdr":
         return ros2_form(name)
     if encoding == "ros1":
@@ -75,7 +76,7 @@ def message_form(encoding: str, schema: Schema | None) -> Form:
                 why = f"which needs {EXTRA}"
             except DAMAGE as error:
                 why = f"whose schema cannot be used ({reason(error)})"
-    return Form(f"{name}, encoded as {encoding}, {why}", lambda data: data)
+    return Form(f"{name}, encoded as {encoding or repr(encoding)}, {why}", lambda data: data)
 
 
 def ros2_form(name: str) -> Form:

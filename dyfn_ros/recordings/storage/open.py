@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import re
 import shutil
@@ -157,7 +158,9 @@ def _open_folder(path: Path) -> Storage:
     listed = {file: part for file, part in parts.items() if file not in contents.renamed}
     unlisted = [*contents.unlisted, *(contents.renamed if listed else [])]
     remarks += [f"{f}: not read, metadata.yaml does not list it" for f in unlisted]
-    remarks += [f"{f}: not read, by its name a copy in another format" for f in contents.copies]
+    remarks += [
+        f"{f}: not read, a copy of another file, by its name or bytes" for f in contents.copies
+    ]
     return ChainedStorage([*(listed or parts).values()], [*contents.missing, *losses], remarks)
 
 
@@ -198,8 +201,8 @@ class _Contents:
 
     missing: sentences about files that metadata.yaml lists and that are not there. renamed:
     those of `files` that may be the missing ones. unlisted: the others that are not listed.
-    copies: files of another format with the name of one of `files`. messages: how many there are
-    by metadata.yaml. problem: why that cannot be used.
+    copies: those that are one of `files` again, in another format or by another name. messages:
+    how many there are by metadata.yaml. problem: why that cannot be used.
     """
 
     files: list[Path]
@@ -241,11 +244,25 @@ def _contents(path: Path) -> _Contents:
 
 
 def _without_copies(files: list[Path]) -> tuple[list[Path], list[Path]]:
-    """Files with different names, and those that are the same in another format by their names."""
+    """Files that differ, and those that are the same: in another format by their names, or byte for
+    byte by another name."""
     kept: dict[str, Path] = {}
     for file in sorted(files, key=lambda f: [*READERS].index(Path(_plain_name(f)).suffix.lower())):
         kept.setdefault(_stem(file), file)
-    return [f for f in files if kept[_stem(f)] == f], [f for f in files if kept[_stem(f)] != f]
+    different: list[Path] = []
+    for file in sorted(files, key=lambda f: len(f.name)):  # `walk (1).mcap` is the copy
+        same = any(_same_bytes(file, other) for other in different)
+        if kept[_stem(file)] == file and not same:
+            different.append(file)
+    return [f for f in files if f in different], [f for f in files if f not in different]
+
+
+def _same_bytes(one: Path, other: Path) -> bool:
+    """Whether two files hold the same; they are read when they are of one size."""
+    try:
+        return one.stat().st_size > 0 and filecmp.cmp(one, other, shallow=False)
+    except OSError:
+        return False
 
 
 def _stem(path: Path) -> str:

@@ -87,3 +87,13 @@ def test_a_video_that_ends_early_says_so(tmp_path: Path) -> None:
     frames = list(video_frames(video, warnings.append))
     assert 0 < len(frames) < 40
     assert len(warnings) == 1 and "announced are 5.9 s" in warnings[0]
+
+
+@pytest.mark.parametrize("name", ["12:30.mp4", "http:walk.mp4", "50%41.mp4"])
+def test_a_name_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    make_video(tmp_path / "walk.mp4", [0.0, 0.04, 0.08]).rename(tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    recording = open_recording(Path(name))
+    assert recording.expected_frames == 3
+    assert len([*recording.frames()]) == 3
+    assert not recording.notes.losses

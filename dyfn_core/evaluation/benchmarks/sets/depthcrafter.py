@@ -72,7 +72,7 @@ def _read(video: Path, truth: Path, numbers: Sequence[int]) -> Iterator[Benchmar
 
 def _images(path: Path) -> Iterator[np.ndarray]:
     """Every frame of a video, H x W x 3 uint8 RGB."""
-    capture = cv2.VideoCapture(str(path))
+    capture = cv2.VideoCapture(str(path.absolute()))
     try:
         if not capture.isOpened():
             raise FrameError(f"{path}: no video that can be decoded")
