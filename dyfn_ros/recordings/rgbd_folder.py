@@ -20,6 +20,7 @@ from dyfn_core.data.rgbd.layouts import (
     layout_of,
     open_folder,
 )
+from dyfn_core.data.rgbd.lists import ABSENT
 from dyfn_ros.recordings.errors import RecordingError
 from dyfn_ros.recordings.frames import Notes, RecordedFrame
 from dyfn_ros.recordings.rgbd_writer import FrameToRecord, in_nanoseconds
@@ -36,13 +37,16 @@ def is_rgbd_folder(path: Path) -> bool:
     return layout_of(path) is not None and not (path / "metadata.yaml").exists()
 
 
-def open_rgbd(path: Path, warn: Lose, options: FolderOptions | None = None) -> RgbdFolder:
+def open_rgbd(
+    path: Path, warn: Lose, options: FolderOptions | None = None, lose: Lose | None = None
+) -> RgbdFolder:
     """Find the frames of an RGB-D folder.
 
     Args:
         path: of a layout of dyfn_core.data.rgbd.
         warn: takes what is not used, a line for each reason.
         options: instead of what the folder says.
+        lose: takes the files that a list names and that are gone, one by one; warn by default.
 
     Raises:
         RecordingError: another layout, a file of text that cannot be read, or intrinsics that
@@ -55,6 +59,10 @@ def open_rgbd(path: Path, warn: Lose, options: FolderOptions | None = None) -> R
     except DataError as error:
         raise RecordingError(str(error)) from error
     for reason, names in report.problems.items():
+        if lose is not None and reason.endswith(ABSENT):
+            for name in names:
+                lose(f"{name}: {reason}")
+            continue
         warn(f"{len(names)} x {reason} ({names[0]}{', ...' if names[1:] else ''})")
     return folder
 
@@ -157,10 +165,13 @@ class RgbdRecording:
     def __init__(self, path: Path, options: FolderOptions | None = None) -> None:
         self.path = path
         self._warnings: Counter[str] = Counter()
-        self._folder = open_rgbd(path, lambda reason: self._warnings.update([reason]), options)
+        self._gone: list[str] = []
+        self._folder = open_rgbd(
+            path, lambda reason: self._warnings.update([reason]), options, self._gone.append
+        )
         has_depth = bool(self._folder.with_depth) or depth_folder(path).is_dir()
         self.topics = Topics("rgb/", "K.txt", "depth/" if has_depth else None)
-        self.notes = Notes(warnings=self._warnings.copy())
+        self._take_notes()
 
     @property
     def expected_frames(self) -> int:
@@ -173,6 +184,11 @@ class RgbdRecording:
 
     def frames(self) -> Generator[RecordedFrame, None, None]:
         """See Recording."""
+        for index, frame in enumerate(rgbd_frames(self._folder, self._take_notes())):
+            yield as_recorded(index, frame)
+
+    def _take_notes(self) -> Lose:
+        """Begin with what was found when the folder was opened; -> takes what is lost."""
         self.notes = Notes(warnings=self._warnings.copy())
         alike: dict[str, str] = {}  # what is wrong, without the file -> the first that says it
 
@@ -180,8 +196,9 @@ class RgbdRecording:
             _, separator, what = reason.partition(": ")
             self.notes.losses[alike.setdefault(what, reason) if separator else reason] += 1
 
-        for index, frame in enumerate(rgbd_frames(self._folder, lose)):
-            yield as_recorded(index, frame)
+        for reason in self._gone:
+            lose(reason)
+        return lose
 
 
 def as_recorded(index: int, frame: FrameToRecord) -> RecordedFrame:

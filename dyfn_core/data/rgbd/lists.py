@@ -15,6 +15,7 @@ from dyfn_core.data.rgbd.names import in_seconds
 from dyfn_core.geometry.rigid import quaternion_rotation, rigid
 
 Stamped = tuple[float, Path]
+ABSENT = "that is not there"  # ends the reason of a file that is gone
 
 
 def stamped_files(path: Path, report: DataReport) -> list[Stamped]:
@@ -125,5 +126,5 @@ def _file(path: Path, name: str) -> Path:
 def _is_there(file: Path, path: Path, report: DataReport) -> bool:
     there = file.exists()
     if not there:
-        report.miss(f"file named in {path.name} that is not there", file)
+        report.miss(f"file named in {path.name} {ABSENT}", file)
     return there

@@ -152,6 +152,28 @@ def test_what_is_not_paired_is_a_warning_of_a_replay_and_said_by_record(
     assert [frame.depth is None for frame in frames] == [i in (3, 10) for i in range(COUNT)]
 
 
+@pytest.mark.parametrize("lists", [("rgb.txt", "depth.txt"), ("associations.txt",)])
+@pytest.mark.parametrize("gone", [("rgb/2.png",), ("depth/3.png", "depth/4.png")])
+def test_a_picture_that_a_list_names_and_that_is_gone_is_a_loss(
+    lists: tuple[str, ...], gone: tuple[str, ...], tmp_path: Path
+) -> None:
+    folder = tmp_path / "room"
+    for i in range(8):
+        write(folder / "rgb" / f"{i}.png", np.full((*SIZE, 3), 20 * i, np.uint8))
+        write(folder / "depth" / f"{i}.png", np.full(SIZE, 5000 + i, np.uint16))
+    for name in lists:
+        kinds = (name[:-4],) if len(lists) > 1 else ("rgb", "depth")
+        rows = (" ".join(f"{i}.0 {kind}/{i}.png" for kind in kinds) for i in range(8))
+        (folder / name).write_text("\n".join(rows))
+    for name in gone:
+        (folder / name).unlink()
+    recording = open_recording(folder)
+    list(recording.frames())
+    ((loss, count),) = recording.notes.losses.items()
+    assert count == len(gone) and loss.startswith(f"{folder / gone[0]}: file named in ")
+    assert not any("not there" in warning for warning in recording.notes.warnings)
+
+
 @pytest.mark.parametrize("name", ["rgb/2.jpg", "depth/2.png"])
 def test_a_damaged_picture_is_lost_and_named(name: str, tmp_path: Path) -> None:
     not_padded(tmp_path)
