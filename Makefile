@@ -1,4 +1,4 @@
-# make setup | demo | test | test-fast | faults | lint | coverage | docs | bench | wheel | gpu-train    (see README.md)
+# make setup | demo | test | test-fast | faults | lint | coverage | docs | bench | wheel | gpu-check | gpu-train    (see README.md)
 PYTHON ?= python3
 VENV   ?= .venv
 # Any newer torch works as well, e.g. `make setup TORCH=torch`.
@@ -6,7 +6,7 @@ TORCH  ?= torch==2.13.0
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: setup demo test test-fast faults coverage lint docs bench wheel gpu-train clean
+.PHONY: setup demo test test-fast faults coverage lint docs bench wheel gpu-check gpu-train clean
 
 setup: $(READY)
 
@@ -46,6 +46,9 @@ bench: $(READY)
 	mkdir -p out
 	$(BIN)/python benchmarks/speed.py --out out/speed.json --page docs/PERFORMANCE.md
 	$(BIN)/python benchmarks/backends.py
+
+gpu-check: $(READY)
+	$(BIN)/python benchmarks/gpu_check.py
 
 # e.g. make gpu-train GPU_TRAIN="--art out/art --minutes 10"      (see docs/training.md)
 gpu-train: $(READY)

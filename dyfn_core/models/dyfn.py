@@ -85,9 +85,14 @@ class DyFN(nn.Module, ABC):
     def forward(self, features: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
         """features B x C x h x w, previous state -> stabilized features, next state.
 
-        state=None is the first frame: a zero hidden state. Raises ValueError when the state
-        belongs to another batch, another latent size or another kind of stabilizer.
+        state=None is the first frame: a zero hidden state. Float32 under autocast too: the
+        statistics are the scale. Raises ValueError when the state belongs to another batch,
+        another latent size or another kind of stabilizer.
         """
+        kind = features.device.type
+        if torch.is_autocast_enabled(kind):
+            with torch.autocast(kind, enabled=False):
+                return self.forward(features.float(), state)
         if features.shape[-2] * features.shape[-1] < 2:
             raise ValueError(
                 f"a latent of {features.shape[-2]} x {features.shape[-1]} cells has no standard "

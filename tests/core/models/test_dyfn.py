@@ -222,3 +222,17 @@ def test_gradients_reach_every_parameter() -> None:
                 if parameter.grad is None or not parameter.grad.abs().sum() > 0
             ]
             assert not still, (kind, form)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_under_autocast_statistics_and_state_are_float32(kind: str) -> None:
+    module = make(kind)
+    exact, rounded = None, None
+    for frame in range(3):
+        expected, exact = module(latent(frame), exact)
+        with torch.autocast("cpu", torch.bfloat16):
+            found, rounded = module(latent(frame), rounded)
+        assert found.dtype == torch.float32 and torch.equal(found, expected)
+        assert torch.equal(rounded.hidden, exact.hidden)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert module(latent(3).bfloat16(), rounded)[0].dtype == torch.float32
