@@ -244,9 +244,11 @@ def _unavailable(repo: str, file: str, asked: Asked, error: Exception) -> str:
         )
     here = model_folder() / repo / file
     put = f"put it at {here} (or anywhere, and pass its path)" if asked.by_hand else "pass its path"
+    why = f"{type(error).__name__}: {error}"
+    if constants.HF_HUB_OFFLINE:
+        why = "HF_HUB_OFFLINE is set, which forbids to ask the Hub"
     return (
-        f"no such file here, and cannot download {file} of Hub model {repo}{revision} "
-        f"({type(error).__name__}: {error}). "
+        f"no such file here, and cannot download {file} of Hub model {repo}{revision} ({why}). "
         f"Download {hf_hub_url(repo, file, revision=asked.revision)} on a machine with a network "
         f"and {put}. The Hub's cache is {cache}"
     )

@@ -87,3 +87,13 @@ def test_a_repository_without_a_config_is_told_by_its_files(
     monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda *_, **__: 1 / 0)
     with pytest.raises(CheckpointError, match="says what it is; supported are"):
         load_model("someone/model")
+
+
+def test_a_hub_that_may_not_be_asked_is_told_by_its_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match="HF_HUB_OFFLINE is set") as caught:
+        load_model("Ruicheng/moge-vitl")
+    assert "check your connection" not in str(caught.value)
