@@ -30,14 +30,16 @@ def reference_bench(domain: dict[str, str]) -> Iterator[Bench]:
 
 
 def no_metres(
-    camera: str, change: Change, frame: str = "", late: float = 0.0
+    camera: str, says: str, change: Change, frame: str = "", late: float = 0.0
 ) -> Callable[[Bench], str]:
     """Nothing is known of the scale, and such measurements come: no metres come of them.
 
-    change: of a good measurement. frame: frame_id. late: seconds after the picture.
+    says: what diagnostics say before good ones come. change: of a good measurement.
+    frame: frame_id. late: seconds after the picture.
     """
 
     def do(bench: Bench) -> str:
+        since = len(bench.said)
         assert bench.ask(Trigger, f"{camera}/reset", Trigger.Request()).success
         for _ in range(COUNT):
             image, stamp = bench.fresh(), bench.step()
@@ -47,13 +49,14 @@ def no_metres(
             bench.probe.publish(f"/{camera}/reference", message)
             found = outcome(bench, bench.work(camera, image_message(image), stamp), None)
             assert found == NO_METRES, f"metres of nothing: {found}"
+        bench.wait_said(says, since)
         return NO_METRES
 
     return do
 
 
 def refused(camera: str, name: str, says: str, change: Change, **options: Any) -> Fault:
-    do = no_metres(camera, change, **options)
+    do = no_metres(camera, says, change, **options)
     return Fault(f"{MEASURED[camera]}: {name}", do, (says,), True, camera, within=5)
 
 
